@@ -1,0 +1,3 @@
+//! Coordinate reference systems: positions between longitude/latitude and a store's
+//! metric grid.
+

@@ -1,0 +1,1 @@
+//! Flights: keyframes and the smooth path through them.

@@ -1,0 +1,1 @@
+//! Tiles to pictures: merging, and the files pictures go to.

@@ -1,0 +1,1 @@
+//! Who renders what, and when: a pure state machine, with its simulator.

@@ -1,0 +1,1 @@
+//! The coordinator: driver task, peers, sinks.

@@ -1,0 +1,1 @@
+//! The ray-casting core: resident tiles, camera, region and quality to a film tile.

@@ -1,0 +1,1 @@
+//! The worker: session, link, render pool, blob cache.

@@ -1,0 +1,1 @@
+//! Rasters to a terrain store: mosaic, reproject, fill, report.

@@ -1,0 +1,8 @@
+//! Reads the raster files that GIS people own: elevation and photos.
+//!
+//! [`open`] looks at the bytes, not only at the name, and gives a [`Raster`]: a grid with
+//! a place on the map from which windows can be read. Files are never loaded whole
+//! unless their format leaves no choice, and nothing is allocated for before the declared
+//! size has been checked against the file's length and a named limit.
+
+pub mod info;

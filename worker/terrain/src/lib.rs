@@ -1,0 +1,14 @@
+//! The terrain store: one file of hashed tiles, and what is built from it in memory.
+//!
+//! Read in this order: [`layout`] says what a store contains, [`tile`] what one tile is,
+//! as bytes and in memory; [`store`] is the file, [`build`] makes one, [`cache`] keeps
+//! blobs of it on a worker's disk, [`resident`] holds decoded tiles for the ray caster,
+//! [`sample`] answers "how high is it here".
+//!
+//! Terminology: a *post* is one sample at a grid point; a *cell* lies between four
+//! posts; a *tile* is [`layout::TILE_CELLS`] cells a side; a *layer* is a pyramid of
+//! grids of one kind; level 0 of a layer is its finest grid.
+
+pub mod layout;
+pub mod resident;
+pub mod tile;

@@ -1,0 +1,1 @@
+//! Procedural terrain: eroded mountains with a plausible aerial photo, from a seed.
