@@ -1,0 +1,312 @@
+//! Messages between a client and the coordinator: shots and their frames.
+//!
+//! A client sends [`Submit`] under a number of its own choice, then its [`Cameras`],
+//! then hears [`Accepted`] or [`Rejected`]. It supplies the shot's terrain when asked
+//! and answers every [`Frame`] by a [`FrameTaken`], which lets the next one be sent.
+
+use super::{Body, Unfit, fit_name, fit_reason, own_twin};
+use crate::limits::{CAMERAS_MAX, FRAMES_IN_FLIGHT_MAX, FRAMES_MAX};
+use crate::message::work::RenderReport;
+use crate::pixels::Pixels;
+use crate::twin::{
+    CameraTwin, QualityTwin, ShadingTwin, SplitTwin, fit_camera, fit_quality, fit_shading,
+    fit_size, fit_split,
+};
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::Shading;
+
+/// A new shot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Submit {
+    /// The client's own number for it, new on this connection.
+    pub number: u32,
+    /// What to call it.
+    pub name: String,
+    /// The index of its terrain store.
+    pub index: BlobHash,
+    /// Light, air and sky.
+    pub shading: Shading,
+    /// Method and samples.
+    pub quality: Quality,
+    /// Width of its frames, pixels.
+    pub width: u32,
+    /// Height of its frames, pixels.
+    pub height: u32,
+    /// How frames are cut into jobs.
+    pub split: Split,
+    /// Number of frames, at most [`FRAMES_MAX`].
+    pub frames: u32,
+    /// How many frames may be begun and not yet taken, at most [`FRAMES_IN_FLIGHT_MAX`].
+    pub frames_in_flight: u32,
+}
+
+/// Twin of [`Submit`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct SubmitTwin {
+    number: u32,
+    name: String,
+    index: BlobHash,
+    shading: ShadingTwin,
+    quality: QualityTwin,
+    size: [u32; 2],
+    split: SplitTwin,
+    frames: u32,
+    frames_in_flight: u32,
+}
+
+impl Body for Submit {
+    type Wire = SubmitTwin;
+
+    fn to_wire(&self) -> SubmitTwin {
+        SubmitTwin {
+            number: self.number,
+            name: self.name.clone(),
+            index: self.index,
+            shading: (&self.shading).into(),
+            quality: self.quality.into(),
+            size: [self.width, self.height],
+            split: self.split.into(),
+            frames: self.frames,
+            frames_in_flight: self.frames_in_flight,
+        }
+    }
+
+    fn from_wire(wire: SubmitTwin) -> Result<Self, Unfit> {
+        Ok(Submit {
+            number: wire.number,
+            name: wire.name,
+            index: wire.index,
+            shading: wire.shading.try_into()?,
+            quality: wire.quality.try_into()?,
+            width: wire.size[0],
+            height: wire.size[1],
+            split: wire.split.try_into()?,
+            frames: wire.frames,
+            frames_in_flight: wire.frames_in_flight,
+        })
+    }
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_name(&self.name)?;
+        fit_shading(&self.shading)?;
+        fit_quality(self.quality)?;
+        fit_size(self.width, self.height)?;
+        fit_split(self.split)?;
+        let frames = (1..=FRAMES_MAX).contains(&self.frames);
+        Unfit::unless(frames, "the number of frames is out of range")?;
+        let in_flight = (1..=FRAMES_IN_FLIGHT_MAX).contains(&self.frames_in_flight);
+        Unfit::unless(in_flight, "the number of frames in flight is out of range")
+    }
+}
+
+/// Cameras of a shot, in order, at most [`CAMERAS_MAX`] a message.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Cameras {
+    /// The client's number for the shot.
+    pub number: u32,
+    /// The frame of the first of them.
+    pub first: FrameIndex,
+    /// One a frame.
+    pub cameras: Vec<Camera>,
+}
+
+/// Twin of [`Cameras`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct CamerasTwin {
+    number: u32,
+    first: FrameIndex,
+    cameras: Vec<CameraTwin>,
+}
+
+impl Body for Cameras {
+    type Wire = CamerasTwin;
+
+    fn to_wire(&self) -> CamerasTwin {
+        let cameras = self.cameras.iter().map(CameraTwin::from).collect();
+        CamerasTwin { number: self.number, first: self.first, cameras }
+    }
+
+    fn from_wire(wire: CamerasTwin) -> Result<Self, Unfit> {
+        let cameras = wire.cameras.into_iter().map(Camera::try_from).collect::<Result<_, _>>()?;
+        Ok(Cameras { number: wire.number, first: wire.first, cameras })
+    }
+
+    fn check(&self) -> Result<(), Unfit> {
+        let fits = (1..=CAMERAS_MAX).contains(&self.cameras.len());
+        Unfit::unless(fits, "the number of cameras is out of range")?;
+        let end = u64::from(self.first) + self.cameras.len() as u64;
+        Unfit::unless(end <= u64::from(FRAMES_MAX), "the cameras run past the last frame")?;
+        self.cameras.iter().try_for_each(fit_camera)
+    }
+}
+
+/// A frame has been stored; the next may come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameTaken {
+    /// The shot.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+}
+
+impl Body for FrameTaken {
+    own_twin!();
+}
+
+/// The shot is no longer wanted. Answered by a [`ShotFailed`] or, if it was done just
+/// then, a [`ShotDone`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Cancel {
+    /// The shot.
+    pub shot: ShotId,
+}
+
+impl Body for Cancel {
+    own_twin!();
+}
+
+/// The shot is in the queue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Accepted {
+    /// The client's number for it.
+    pub number: u32,
+    /// The farm's.
+    pub shot: ShotId,
+}
+
+impl Body for Accepted {
+    own_twin!();
+}
+
+/// The shot was not taken.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Rejected {
+    /// The client's number for it.
+    pub number: u32,
+    /// Why, and what to do, for people.
+    pub reason: String,
+}
+
+impl Body for Rejected {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_reason(&self.reason)
+    }
+}
+
+/// A finished frame. The pixels travel behind the message.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Frame {
+    /// The shot.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+    /// Number of jobs it was made of.
+    pub jobs: u32,
+    /// The sum over its jobs.
+    pub report: RenderReport,
+    /// From the first job's grant to the last one's pixels, microseconds.
+    pub elapsed_us: u64,
+    /// The pixels of the whole frame.
+    pub pixels: Pixels,
+}
+
+impl Body for Frame {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        self.pixels.check()
+    }
+
+    fn payload(&self) -> Bytes {
+        self.pixels.bytes.clone()
+    }
+
+    fn set_payload(&mut self, payload: Bytes) {
+        self.pixels.bytes = payload;
+    }
+}
+
+/// A frame could not be made.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameFailed {
+    /// The shot.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+    /// Why, for people.
+    pub reason: String,
+}
+
+impl Body for FrameFailed {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_reason(&self.reason)
+    }
+}
+
+/// How far a shot is. Sent now and then; the newest is true.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Progress {
+    /// The shot.
+    pub shot: ShotId,
+    /// Frames finished.
+    pub frames_done: u32,
+    /// Frames that could not be made.
+    pub frames_failed: u32,
+    /// Jobs that run now.
+    pub jobs_running: u32,
+    /// Workers connected now.
+    pub workers: u32,
+}
+
+impl Body for Progress {
+    own_twin!();
+}
+
+/// Every frame is made or has failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ShotDone {
+    /// The shot.
+    pub shot: ShotId,
+    /// Frames finished.
+    pub frames_done: u32,
+    /// Frames that could not be made.
+    pub frames_failed: u32,
+    /// Jobs whose pixels were used.
+    pub jobs: u64,
+    /// Leases granted again because a worker was lost, failed or slow.
+    pub jobs_repeated: u64,
+    /// Wall time from the submission to the last frame, microseconds.
+    pub elapsed_us: u64,
+    /// Sum over all jobs.
+    pub report: RenderReport,
+}
+
+impl Body for ShotDone {
+    own_twin!();
+}
+
+/// The shot has been given up; no more frames come.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ShotFailed {
+    /// The shot.
+    pub shot: ShotId,
+    /// Why, for people.
+    pub reason: String,
+}
+
+impl Body for ShotFailed {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_reason(&self.reason)
+    }
+}

@@ -1,0 +1,233 @@
+//! Messages between the coordinator and a worker: jobs and their results.
+
+use super::{Body, Unfit, fit_reason, own_twin};
+use crate::limits::HAND_BACK_MAX;
+use crate::pixels::Pixels;
+use crate::twin::{
+    CameraTwin, QualityTwin, RegionTwin, ShadingTwin, fit_camera, fit_quality, fit_region,
+    fit_shading, fit_size,
+};
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{BlobHash, FrameIndex, LeaseId, ShotId};
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Region;
+use terrafarm_common::shading::Shading;
+
+/// What all grants of a shot have in common. Sent once, before the first of them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OpenShot {
+    /// The shot.
+    pub shot: ShotId,
+    /// The index of its terrain store.
+    pub index: BlobHash,
+    /// Light, air and sky.
+    pub shading: Shading,
+    /// Method and samples.
+    pub quality: Quality,
+    /// Width of its frames, pixels.
+    pub width: u32,
+    /// Height of its frames, pixels.
+    pub height: u32,
+}
+
+/// Twin of [`OpenShot`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct OpenShotTwin {
+    shot: ShotId,
+    index: BlobHash,
+    shading: ShadingTwin,
+    quality: QualityTwin,
+    size: [u32; 2],
+}
+
+impl Body for OpenShot {
+    type Wire = OpenShotTwin;
+
+    fn to_wire(&self) -> OpenShotTwin {
+        OpenShotTwin {
+            shot: self.shot,
+            index: self.index,
+            shading: (&self.shading).into(),
+            quality: self.quality.into(),
+            size: [self.width, self.height],
+        }
+    }
+
+    fn from_wire(wire: OpenShotTwin) -> Result<Self, Unfit> {
+        Ok(OpenShot {
+            shot: wire.shot,
+            index: wire.index,
+            shading: wire.shading.try_into()?,
+            quality: wire.quality.try_into()?,
+            width: wire.size[0],
+            height: wire.size[1],
+        })
+    }
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_shading(&self.shading)?;
+        fit_quality(self.quality)?;
+        fit_size(self.width, self.height)
+    }
+}
+
+/// One job: a region of one frame, to be answered under its lease by a [`Done`], a
+/// [`Failed`] or a [`HandBack`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grant {
+    /// The lease. The number is never granted again.
+    pub lease: LeaseId,
+    /// The shot, opened before.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+    /// Which pixels of it.
+    pub region: Region,
+    /// Where it is seen from.
+    pub camera: Camera,
+}
+
+/// Twin of [`Grant`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct GrantTwin {
+    lease: LeaseId,
+    shot: ShotId,
+    frame: FrameIndex,
+    region: RegionTwin,
+    camera: CameraTwin,
+}
+
+impl Body for Grant {
+    type Wire = GrantTwin;
+
+    fn to_wire(&self) -> GrantTwin {
+        GrantTwin {
+            lease: self.lease,
+            shot: self.shot,
+            frame: self.frame,
+            region: self.region.into(),
+            camera: (&self.camera).into(),
+        }
+    }
+
+    fn from_wire(wire: GrantTwin) -> Result<Self, Unfit> {
+        Ok(Grant {
+            lease: wire.lease,
+            shot: wire.shot,
+            frame: wire.frame,
+            region: wire.region.try_into()?,
+            camera: wire.camera.try_into()?,
+        })
+    }
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_camera(&self.camera)?;
+        fit_region(&self.region, self.camera.width, self.camera.height)
+    }
+}
+
+/// A lease ends early: stop, and send nothing under it any more. One that has just been
+/// answered may cross this message; that is no error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Revoke {
+    /// The lease.
+    pub lease: LeaseId,
+}
+
+impl Body for Revoke {
+    own_twin!();
+}
+
+/// No more grants of a shot: what was kept for it may go.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CloseShot {
+    /// The shot.
+    pub shot: ShotId,
+}
+
+impl Body for CloseShot {
+    own_twin!();
+}
+
+/// Finish the job that runs, hand back the others, say goodbye.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Drain {}
+
+impl Body for Drain {
+    own_twin!();
+}
+
+/// What a job took.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct RenderReport {
+    /// Time from the start of rendering to its end, microseconds, waiting for tiles
+    /// left out.
+    pub cost_us: u64,
+    /// Rays cast.
+    pub rays: u64,
+    /// Cells and blocks that they visited.
+    pub steps: u64,
+    /// Whether the camera was below the ground.
+    pub below_ground: bool,
+}
+
+/// The pixels of a job. They travel behind the message.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Done {
+    /// The lease.
+    pub lease: LeaseId,
+    /// What it took.
+    pub report: RenderReport,
+    /// The pixels of the region.
+    pub pixels: Pixels,
+}
+
+impl Body for Done {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        self.pixels.check()
+    }
+
+    fn payload(&self) -> Bytes {
+        self.pixels.bytes.clone()
+    }
+
+    fn set_payload(&mut self, payload: Bytes) {
+        self.pixels.bytes = payload;
+    }
+}
+
+/// A job could not be done by this worker.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failed {
+    /// The lease.
+    pub lease: LeaseId,
+    /// Why, for people.
+    pub reason: String,
+}
+
+impl Body for Failed {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        fit_reason(&self.reason)
+    }
+}
+
+/// Jobs that were not begun and will not be.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HandBack {
+    /// The leases, at most [`HAND_BACK_MAX`].
+    pub leases: Vec<LeaseId>,
+}
+
+impl Body for HandBack {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        Unfit::unless(self.leases.len() <= HAND_BACK_MAX, "too many leases in one message")
+    }
+}
