@@ -19,6 +19,9 @@ pub const TILE_CELLS: usize = 256;
 pub const TILE_RING: usize = 1;
 /// Posts along a side of a tile as stored: −1 ..= 257.
 pub const TILE_POSTS: usize = TILE_CELLS + 1 + 2 * TILE_RING;
+/// The largest height of a post above or below the datum, metres. What lies beyond is
+/// no terrain but a fill value that a file forgot to name; such a post is void.
+pub const MAX_HEIGHT_M: f32 = 1e7;
 /// The largest number of posts along a side of a layer: 2^26, 67 million.
 pub const MAX_POSTS: u64 = 1 << 26;
 /// The largest number of layers.

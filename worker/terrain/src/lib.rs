@@ -9,6 +9,11 @@
 //! posts; a *tile* is [`layout::TILE_CELLS`] cells a side; a *layer* is a pyramid of
 //! grids of one kind; level 0 of a layer is its finest grid.
 
+pub mod codec;
+pub mod color;
 pub mod layout;
+mod planes;
+mod positioned;
 pub mod resident;
+pub mod store;
 pub mod tile;
