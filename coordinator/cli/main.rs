@@ -10,6 +10,7 @@ mod commands;
 mod farm;
 mod input;
 mod progress;
+mod shot;
 
 use clap::Parser;
 use std::process::ExitCode;

@@ -71,11 +71,6 @@ impl Broker {
         }
     }
 
-    /// Bytes kept at this moment.
-    pub fn kept_bytes(&self) -> usize {
-        self.kept_bytes
-    }
-
     /// A worker wants a blob that one of these clients should have.
     pub fn wanted(
         &mut self,
@@ -220,7 +215,7 @@ mod tests {
     fn a_blob_nobody_asked_for_is_dropped() {
         let mut broker = Broker::new(1000);
         assert!(broker.arrived(hash(9), blob(10)).is_empty());
-        assert_eq!(broker.kept_bytes(), 0);
+        assert_eq!(broker.kept_bytes, 0);
     }
 
     #[test]
@@ -255,7 +250,7 @@ mod tests {
                 } else {
                     broker.arrived(hash(n), blob(length));
                 }
-                prop_assert!(broker.kept_bytes() <= 100);
+                prop_assert!(broker.kept_bytes <= 100);
                 prop_assert_eq!(broker.kept.len(), broker.by_age.len());
                 let sum: usize = broker.kept.values().map(|kept| kept.bytes.len()).sum();
                 prop_assert_eq!(sum, broker.kept_bytes);

@@ -37,8 +37,6 @@ pub enum PeerEvent {
     Joined(Greeting),
     /// A message came.
     Said(Message),
-    /// Some bytes of a long message came: the peer is alive.
-    Heard,
     /// The connection has ended; why, in words.
     Gone(LostReason, String),
 }
@@ -136,7 +134,6 @@ impl Farm {
                 self.workers.insert(worker, state);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
             }
-            PeerEvent::Heard => self.schedule(now, Event::HeardFrom { worker }),
             PeerEvent::Gone(why, how) => {
                 if let Some(name) = self.forget_worker(worker) {
                     match why {
@@ -190,7 +187,6 @@ impl Farm {
                 tracing::info!(client = client.0, name = %greeting.name, "client joined");
                 self.clients.insert(client, greeting);
             }
-            PeerEvent::Heard => {}
             PeerEvent::Gone(_, how) => {
                 if self.clients.remove(&client).is_some() {
                     tracing::info!(client = client.0, "client left: {how}");

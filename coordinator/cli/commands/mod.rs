@@ -6,6 +6,9 @@ mod serve;
 mod simulate;
 mod terrain;
 
+use serve::runtime;
+pub use serve::stop_signal;
+
 use crate::Outcome;
 use crate::args::Command;
 

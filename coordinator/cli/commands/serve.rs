@@ -54,7 +54,7 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
 }
 
 /// The async runtime of a service: its threads move bytes, they never render.
-pub fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
+pub(super) fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
