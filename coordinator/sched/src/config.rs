@@ -3,13 +3,13 @@
 /// The most workers connected at once; more are dropped as they join.
 pub const MAX_WORKERS: usize = 4096;
 /// The most shots queued or running at once; more are refused.
-pub const MAX_SHOTS: usize = 1024;
+pub const MAX_SHOTS: usize = 256;
 /// The most frames of one shot: 46 hours at 60 Hz. Frames cost memory only in flight.
 pub const MAX_FRAMES: u32 = 10_000_000;
 /// The most frames of one shot that may be open or waiting to be taken.
 pub const MAX_FRAMES_IN_FLIGHT: u32 = 1024;
 /// The most jobs that one frame can be cut into.
-pub const MAX_JOBS_PER_FRAME: u64 = 65_536;
+pub const MAX_JOBS_PER_FRAME: u64 = 16_384;
 
 /// Settings of the scheduler. The defaults are for batch rendering on a local network.
 #[derive(Debug, Clone, PartialEq)]

@@ -33,12 +33,16 @@
 //! small ones at the end (guided self-scheduling), each as long as its worker is fast.
 //! Frame n + 1 starts before n is done, as in section 3 of the flythrough paper.
 
+mod check;
 mod config;
 mod event;
+mod grant;
 mod lease;
+mod outcome;
 mod rng;
 mod scheduler;
 mod shot;
+pub mod sim;
 mod split;
 mod worker;
 
