@@ -299,9 +299,9 @@ pub struct Simulate {
     /// Workers
     #[arg(long, default_value_t = 31, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub workers: u32,
-    /// Frames of the shot
-    #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    pub frames: u32,
+    /// Frames of the shot [default: about a minute of work]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
     /// Same seed, same run
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
