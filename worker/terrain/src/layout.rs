@@ -98,8 +98,8 @@ pub struct Level {
 /// One tile as the index knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TileEntry {
-    /// SHA-256 of the encoded tile. All zero for a tile without a single valid post,
-    /// which has no bytes.
+    /// SHA-256 of the encoded tile. All zero for a tile without a single valid post (its
+    /// ring left out), which has no bytes.
     pub hash: BlobHash,
     /// Position of the encoded tile in the store file, bytes.
     pub offset: u64,
@@ -270,12 +270,13 @@ impl Layer {
             if level.tiles != tiles || level.entries.len() as u64 != expected {
                 return Err(format!("level {number} has the wrong number of tiles"));
             }
-            if level
-                .entries
-                .iter()
-                .any(|e| e.min.is_nan() || e.max.is_nan() || e.deviation.is_nan())
-            {
-                return Err(format!("level {number} has a bound that is not a number"));
+            let sound = |e: &TileEntry| {
+                (e.is_empty()
+                    || (-MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M))
+                    && e.deviation >= 0.0
+            };
+            if !level.entries.iter().all(sound) {
+                return Err(format!("level {number} has a bound that is out of range"));
             }
         }
         Ok(())

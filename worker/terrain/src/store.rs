@@ -100,6 +100,7 @@ pub enum StoreError {
 pub struct StoreReader {
     path: PathBuf,
     file: File,
+    file_bytes: u64,
     index: Arc<StoreIndex>,
     index_hash: BlobHash,
     index_bytes: Vec<u8>,
@@ -133,8 +134,15 @@ impl StoreReader {
                 blobs.insert(entry.hash, (entry.offset, entry.length));
             }
         }
-        let path = path.to_owned();
-        Ok(StoreReader { path, file, index: Arc::new(index), index_hash, index_bytes, blobs })
+        Ok(StoreReader {
+            path: path.to_owned(),
+            file,
+            file_bytes: length,
+            index: Arc::new(index),
+            index_hash,
+            index_bytes,
+            blobs,
+        })
     }
 
     /// The file.
@@ -154,8 +162,7 @@ impl StoreReader {
 
     /// Length of the file, bytes.
     pub fn file_bytes(&self) -> u64 {
-        let last = self.blobs.values().map(|&(offset, length)| offset + u64::from(length)).max();
-        last.unwrap_or(HEADER_BYTES) + self.index_bytes.len() as u64
+        self.file_bytes
     }
 
     /// An encoded tile, or the index, by its hash: what a worker asks for.
@@ -296,5 +303,118 @@ impl Header {
             Some(_) => Ok(header),
             None => Err(damaged("its place is out of range")),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::fixture::{Ground, height_layer, hills};
+    use std::fs;
+
+    fn store() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("hills.terrain");
+        Ground::new().heights(height_layer([300, 40]), hills).build(&path).unwrap();
+        (folder, path)
+    }
+
+    const KEY: TileKey = TileKey { layer: 0, level: 0, tx: 1, ty: 0 };
+
+    #[test]
+    fn blobs_are_found_by_hash_and_tiles_by_place() {
+        let (_folder, path) = store();
+        let store = StoreReader::open(&path).unwrap();
+        assert_eq!(store.file_bytes(), fs::metadata(&path).unwrap().len());
+        let (hash, bytes) = store.index_blob();
+        assert_eq!(store.read_blob(&hash).unwrap(), bytes);
+        assert_eq!(&decode_index(bytes).unwrap(), &**store.index());
+        let entry = store.index().entry(KEY).unwrap();
+        assert_eq!(hash_of(&store.read_blob(&entry.hash).unwrap()), entry.hash);
+        let Some(Tile::Height(tile)) = store.read_tile(KEY).unwrap() else { panic!("heights") };
+        assert_eq!(tile.post(3, 5), hills(259, 5));
+        let outside = store.read_tile(TileKey { tx: 2, ..KEY }).err().unwrap();
+        assert!(outside.to_string().ends_with("has no tile (2, 0) of level 0 of layer 0"));
+        assert!(matches!(store.read_blob(&BlobHash([7; 32])), Err(StoreError::NoSuchTile { .. })));
+    }
+
+    #[test]
+    fn every_truncation_is_an_error() {
+        let (_folder, path) = store();
+        let bytes = fs::read(&path).unwrap();
+        for length in (0..HEADER_BYTES as usize).chain((64..bytes.len()).step_by(97)) {
+            fs::write(&path, &bytes[..length]).unwrap();
+            let error = StoreReader::open(&path).unwrap_err();
+            assert!(
+                matches!(error, StoreError::NotAStore { .. } | StoreError::Truncated { .. }),
+                "{length}: {error}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_flipped_bit_anywhere_is_an_error_and_names_the_tile() {
+        let (_folder, path) = store();
+        let bytes = fs::read(&path).unwrap();
+        for at in (0..bytes.len()).step_by(53) {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 16;
+            fs::write(&path, &damaged).unwrap();
+            let Ok(store) = StoreReader::open(&path) else { continue };
+            let keys = [0, 1].map(|tx| TileKey { tx, ..KEY });
+            let top = TileKey { level: 1, tx: 0, ..KEY };
+            let errors: Vec<String> = keys
+                .iter()
+                .chain([&top])
+                .filter_map(|&key| store.read_tile(key).err())
+                .map(|error| error.to_string())
+                .collect();
+            let header_padding = (12..16).contains(&at);
+            assert_eq!(errors.len(), usize::from(!header_padding), "byte {at}");
+            assert!(errors.iter().all(|text| text.contains("of layer 0 is damaged")));
+        }
+    }
+
+    #[test]
+    fn other_files_and_versions_are_told_apart() {
+        let (_folder, path) = store();
+        let bytes = fs::read(&path).unwrap();
+        fs::write(&path, b"II*\0 a TIFF, surely longer than a header of sixty-four bytes is......")
+            .unwrap();
+        assert!(matches!(StoreReader::open(&path), Err(StoreError::NotAStore { .. })));
+        let mut newer = bytes.clone();
+        newer[8] = 200;
+        fs::write(&path, &newer).unwrap();
+        assert!(matches!(
+            StoreReader::open(&path),
+            Err(StoreError::OtherVersion { found: 200, .. })
+        ));
+        let longer = [bytes, vec![0]].concat();
+        fs::write(&path, longer).unwrap();
+        assert!(matches!(StoreReader::open(&path), Err(StoreError::Index { .. })));
+        fs::remove_file(&path).unwrap();
+        assert!(matches!(StoreReader::open(&path), Err(StoreError::Io { .. })));
+    }
+
+    #[test]
+    fn many_threads_read_at_once() {
+        let (_folder, path) = store();
+        let store = StoreReader::open(&path).unwrap();
+        std::thread::scope(|scope| {
+            for thread in 0..8 {
+                let store = &store;
+                scope.spawn(move || {
+                    for round in 0..40 {
+                        let tx = (thread + round) % 2;
+                        let Ok(Some(Tile::Height(tile))) = store.read_tile(TileKey { tx, ..KEY })
+                        else {
+                            panic!("tile {tx}")
+                        };
+                        assert_eq!(tile.post(1, 1), hills(u64::from(tx) * 256 + 1, 1));
+                    }
+                });
+            }
+        });
     }
 }
