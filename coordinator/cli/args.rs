@@ -111,15 +111,9 @@ pub struct Import {
     /// own if metric, else the UTM zone of their centre]
     #[arg(long)]
     pub crs: Option<String>,
-    /// Reference system of elevation files that do not say theirs
+    /// Reference system of files that do not say theirs
     #[arg(long)]
     pub source_crs: Option<String>,
-    /// Reference system of photos that do not say theirs
-    #[arg(long)]
-    pub photo_crs: Option<String>,
-    /// Distance between posts after resampling, metres
-    #[arg(long, value_name = "METRES")]
-    pub spacing: Option<f64>,
     /// Fill voids up to this many posts wide from their rim
     #[arg(long, value_name = "POSTS")]
     pub fill_voids: Option<u32>,
