@@ -1,1 +1,69 @@
-//! The ray-casting core: resident tiles, camera, region and quality to a film tile.
+//! The ray-casting core: resident tiles and a view to pixels.
+//!
+//! [`render`] knows no network, no thread pool and no log. A pixel is a function of the
+//! store, the camera, the shading and the quality alone: not of the region that is asked
+//! for, nor of how a frame is split, nor of which tiles happen to be in memory. Where a
+//! tile is needed but not loaded, the tile is named and the pixel left for later; the
+//! caller loads what is missing and goes on with [`Progress::advance`] until nothing is.
+//!
+//! **The surface.** Over each height layer it is the bilinear interpolant of level 0 in
+//! every cell whose four posts are valid; later layers lie on top of earlier ones over
+//! the rectangle of their posts. The ground is solid: a ray hits at the first point of
+//! its way that is at or below the surface of a cell which it is in for a positive
+//! length. So the edge of the terrain, the border of a layer and the rim of a void are
+//! walls when a ray comes upon them from below, and rays pass over voids. A camera that
+//! is at or below the surface sees the colour `below_ground` everywhere.
+//!
+//! Read in this order: [`path`](self) is the way of a ray over flat or round ground,
+//! `grid` where it crosses the lines of a layer, `cell` where it meets the surface;
+//! `reference` walks from cell to cell, `exact` finds the same contacts by skipping what
+//! lies below the ray, with maxima from [`Pyramid`]; `field` says which layer holds
+//! where; `progress` turns a region into rays and `shade` contacts into colours.
+//!
+//! Every PC computes the same bytes: no platform sine, exponential or power and no fused
+//! multiplication is used in anything that ends in a pixel.
+
+mod cell;
+mod exact;
+mod field;
+mod grid;
+#[cfg(test)]
+mod oracle;
+mod path;
+mod progress;
+mod pyramid;
+mod reference;
+mod shade;
+mod srgb;
+#[cfg(test)]
+mod tests_support;
+
+pub use progress::{Hit, Missing, Progress, Rendered, Stats, cast};
+pub use pyramid::Pyramid;
+
+use terrafarm_common::camera::Camera;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Region;
+use terrafarm_common::shading::Shading;
+use terrafarm_terrain::resident::Resident;
+
+/// What is to be seen, and how well.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Where from; must be [`Camera::is_valid`].
+    pub camera: Camera,
+    /// Light, air and the shape of the Earth.
+    pub shading: Shading,
+    /// Method and samples a pixel.
+    pub quality: Quality,
+}
+
+/// Renders a region with the tiles at hand. `pyramid` is that of the resident's index.
+///
+/// Pixels that depend on tiles which are not loaded stay black, and the tiles are named;
+/// use [`Progress`] to go on without repeating what is done.
+pub fn render(resident: &Resident, pyramid: &Pyramid, view: &View, region: Region) -> Rendered {
+    let mut progress = Progress::new(region);
+    let missing = progress.advance(resident, pyramid, view);
+    progress.into_rendered(missing)
+}

@@ -1,0 +1,174 @@
+//! The surface as a whole: which layer holds at each place, and how tiles are reached.
+//!
+//! Later height layers lie on top of earlier ones over the rectangle of their posts. A
+//! ray's way is cut at the borders of these rectangles into *stretches*; over each a
+//! single layer, its owner, is the surface.
+
+use crate::cell::Corners;
+use crate::grid::{GridRay, cells_of};
+use crate::path::Path;
+use crate::pyramid::Pyramid;
+use glam::DVec3;
+use std::collections::BTreeSet;
+use terrafarm_terrain::layout::{Layer, LayerKind, StoreIndex, TILE_CELLS, TileKey};
+use terrafarm_terrain::resident::{Lookup, Resident};
+use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
+
+/// The height layers of a store and the tiles at hand.
+#[derive(Clone, Copy)]
+pub(crate) struct Field<'a> {
+    pub resident: &'a Resident,
+    pub pyramid: &'a Pyramid,
+}
+
+/// Tiles that were needed but not loaded.
+#[derive(Debug, Default)]
+pub(crate) struct Wanted {
+    keys: BTreeSet<TileKey>,
+    /// How often a tile was wanted: tells whether one was since it was looked at last.
+    pub count: u64,
+}
+
+impl Wanted {
+    pub(crate) fn add(&mut self, key: TileKey) {
+        self.count += 1;
+        self.keys.insert(key);
+    }
+
+    /// Moves the keys into another set.
+    pub(crate) fn drain_into(&mut self, keys: &mut BTreeSet<TileKey>) {
+        keys.append(&mut self.keys);
+    }
+}
+
+/// Where a ray meets the surface.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Contact {
+    /// Index into the layers of the store.
+    pub layer: usize,
+    /// Cell of level 0.
+    pub cell: [i32; 2],
+    /// Parameter of the ray.
+    pub u: f64,
+    /// Height of the ray there, metres.
+    pub z: f64,
+    /// Where in the cell, 0 to 1 along x and y.
+    pub place: [f64; 2],
+    /// The posts of the cell.
+    pub corners: Corners,
+}
+
+/// What became of a ray.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Outcome {
+    Hit(Contact),
+    Miss,
+    /// A tile that the answer depends on is not loaded.
+    Unfinished,
+}
+
+/// A part of a ray over which one layer is the surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Stretch {
+    /// Position in the list of rays.
+    pub ray: usize,
+    pub start_u: f64,
+    pub end_u: f64,
+}
+
+/// A tile of level 0 as a ray finds it.
+#[derive(Clone, Copy)]
+pub(crate) enum Ground<'a> {
+    Loaded(&'a HeightTile),
+    Void,
+    Absent,
+}
+
+impl<'a> Field<'a> {
+    pub(crate) fn index(&self) -> &'a StoreIndex {
+        self.resident.index()
+    }
+
+    /// A ray in the grids of all height layers, in their order.
+    pub(crate) fn grid_rays(&self, path: &Path, rays: &mut Vec<(usize, GridRay)>) {
+        rays.clear();
+        for (number, layer) in self.index().layers_of(LayerKind::Height) {
+            rays.push((number, GridRay::new(layer, path)));
+        }
+    }
+
+    pub(crate) fn ground(&self, key: TileKey) -> Ground<'a> {
+        match self.resident.height(key) {
+            Lookup::Found(tile) => Ground::Loaded(tile),
+            Lookup::Empty => Ground::Void,
+            Lookup::Absent => Ground::Absent,
+        }
+    }
+
+    /// Whether a place is at or below the surface; the key of the tile that is needed to
+    /// tell if it is not loaded.
+    pub(crate) fn is_below(&self, position: DVec3) -> Result<bool, TileKey> {
+        let holds = |layer: &Layer| {
+            let far = layer.far_corner();
+            let within = |axis: usize| (layer.origin[axis]..=far[axis]).contains(&position[axis]);
+            !cells_of(layer).contains(&0) && within(0) && within(1)
+        };
+        let layers = self.index().layers_of(LayerKind::Height);
+        let owner = layers.filter(|(_, layer)| holds(layer)).last();
+        let Some((number, layer)) = owner else { return Ok(false) };
+        let cells = cells_of(layer);
+        let place =
+            [0, 1].map(|axis| (position[axis] - layer.origin[axis]) * (1.0 / layer.spacing[axis]));
+        let cell = [0, 1].map(|axis| (place[axis].floor() as i32).clamp(0, cells[axis] - 1));
+        let key = tile_key(number, cell);
+        let highest = layer.entry(0, key.tx, key.ty).map_or(f32::INFINITY, |entry| entry.max);
+        if position.z > f64::from(highest) {
+            return Ok(false);
+        }
+        match self.ground(key) {
+            Ground::Absent => Err(key),
+            Ground::Void => Ok(false),
+            Ground::Loaded(tile) => {
+                let [x, y] = [0, 1].map(|axis| place[axis] - f64::from(cell[axis]));
+                Ok(corners_in(tile, cell).is_some_and(|corners| position.z <= corners.height(x, y)))
+            }
+        }
+    }
+}
+
+/// The tile of level 0 that holds a cell.
+#[inline]
+pub(crate) fn tile_key(layer: usize, cell: [i32; 2]) -> TileKey {
+    TileKey {
+        layer: layer as u16,
+        level: 0,
+        tx: (cell[0] >> MAXIMA_LEVELS) as u32,
+        ty: (cell[1] >> MAXIMA_LEVELS) as u32,
+    }
+}
+
+/// The corners of a cell, if it has a surface.
+#[inline(always)]
+pub(crate) fn corners_in(tile: &HeightTile, cell: [i32; 2]) -> Option<Corners> {
+    let [i, j] = cell.map(|index| index as usize & (TILE_CELLS - 1));
+    Corners::new(tile.corners(i, j))
+}
+
+/// The first stretch that begins at or after `u`.
+pub(crate) fn next_stretch(rays: &[(usize, GridRay)], u: f64) -> Option<Stretch> {
+    let over = |ray: &GridRay| ray.enter_u <= u && u < ray.exit_u;
+    let later = |rays: &[(usize, GridRay)]| {
+        let starts = rays.iter().map(|(_, ray)| ray).filter(|ray| ray.enter_u < ray.exit_u);
+        starts.map(|ray| ray.enter_u).filter(|&enter_u| enter_u > u).fold(f64::INFINITY, f64::min)
+    };
+    match rays.iter().rposition(|(_, ray)| over(ray)) {
+        Some(owner) => {
+            let end_u = rays[owner].1.exit_u.min(later(&rays[owner + 1..]));
+            Some(Stretch { ray: owner, start_u: u, end_u })
+        }
+        None => {
+            let start_u = later(rays);
+            if start_u.is_finite() { next_stretch(rays, start_u) } else { None }
+        }
+    }
+}
