@@ -76,7 +76,7 @@ impl Outbox {
 /// What the writer does next.
 enum Next {
     Urgent(Message),
-    Bulk(Frames),
+    Bulk(Message),
     Part,
     End,
 }
@@ -87,9 +87,9 @@ impl<W: AsyncWrite + Unpin> Writer<W> {
     pub async fn run(mut self, mut queues: OutboxEnd) -> Result<(), LinkError> {
         let mut train: Option<Frames> = None;
         loop {
-            match self.next(&mut queues, train.is_some()).await? {
+            match queues.next(train.is_some()).await {
                 Next::Urgent(message) => self.send(&message).await?,
-                Next::Bulk(frames) => train = Some(frames),
+                Next::Bulk(message) => train = Some(encode(self.version, &message)?),
                 Next::End => return self.close().await,
                 Next::Part => match train.as_mut().and_then(Iterator::next) {
                     Some(frame) => self.write(frame).await?,
@@ -101,16 +101,18 @@ impl<W: AsyncWrite + Unpin> Writer<W> {
             }
         }
     }
+}
 
-    async fn next(&self, queues: &mut OutboxEnd, in_train: bool) -> Result<Next, LinkError> {
+impl OutboxEnd {
+    async fn next(&mut self, in_train: bool) -> Next {
         if in_train {
-            return Ok(queues.urgent.try_recv().map_or(Next::Part, Next::Urgent));
+            return self.urgent.try_recv().map_or(Next::Part, Next::Urgent);
         }
         tokio::select! {
             biased;
-            Some(message) = queues.urgent.recv() => Ok(Next::Urgent(message)),
-            Some(message) = queues.bulk.recv() => Ok(Next::Bulk(encode(self.version, &message)?)),
-            else => Ok(Next::End),
+            Some(message) = self.urgent.recv() => Next::Urgent(message),
+            Some(message) = self.bulk.recv() => Next::Bulk(message),
+            else => Next::End,
         }
     }
 }

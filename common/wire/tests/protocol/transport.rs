@@ -1,0 +1,229 @@
+use crate::round_trip::bytes;
+use crate::samples;
+use std::fmt::Debug;
+use std::time::Duration;
+use terrafarm_common::id::BlobHash;
+use terrafarm_wire::Message;
+use terrafarm_wire::limits::PART_BYTES;
+use terrafarm_wire::link::{Connection, HandshakeError, LinkError, Unsent, accept, greet, outbox};
+use terrafarm_wire::message::*;
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, DuplexStream, duplex};
+use tokio::net::{TcpListener, TcpStream};
+
+const LIMIT: Duration = Duration::from_secs(20);
+
+trait Stream: AsyncRead + AsyncWrite + Unpin + Send + Debug + 'static {}
+impl<S: AsyncRead + AsyncWrite + Unpin + Send + Debug + 'static> Stream for S {}
+
+fn memory() -> (DuplexStream, DuplexStream) {
+    duplex(64 << 10)
+}
+
+async fn tcp() -> (TcpStream, TcpStream) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let (near, far) = tokio::join!(TcpStream::connect(address), listener.accept());
+    (near.unwrap(), far.unwrap().0)
+}
+
+fn hello() -> Hello {
+    Hello::new("pc-1", Role::Worker { threads: 4, incarnation: 8 })
+}
+
+async fn connect<S: Stream>((near, far): (S, S)) -> (Connection<S>, Connection<S>) {
+    let coordinator = async {
+        let greeting = accept(far, "terrafarm test", LIMIT).await.unwrap();
+        assert_eq!(greeting.hello(), &hello());
+        let (beat, silence) = (Duration::from_secs(1), Duration::from_secs(3));
+        greeting.welcome(42, "tower", beat, silence).await.unwrap().0
+    };
+    let (worker, coordinator) = tokio::join!(greet(near, hello(), LIMIT), coordinator);
+    let (worker, welcome) = worker.unwrap();
+    assert_eq!((welcome.id, welcome.version), (42, 1));
+    assert_eq!(welcome.silence_us, 3_000_000);
+    (worker, coordinator)
+}
+
+/// What holds of a connection, whatever it runs over.
+async fn every_message_passes_both_ways<S: Stream>(pair: (S, S)) {
+    let (mut worker, mut coordinator) = connect(pair).await;
+    for (_, message) in samples::all() {
+        worker.send(&message).await.unwrap();
+        assert_eq!(coordinator.recv().await.unwrap(), Some(message.clone()));
+        coordinator.send(&message).await.unwrap();
+        assert_eq!(worker.recv().await.unwrap(), Some(message));
+    }
+}
+
+async fn a_clean_end_is_told_from_a_death_inside_a_message<S: Stream>(clean: (S, S), cut: (S, S)) {
+    let (worker, mut coordinator) = connect(clean).await;
+    let (_reader, mut writer) = worker.split();
+    writer.send(&Ping { number: 1 }.into()).await.unwrap();
+    writer.close().await.unwrap();
+    assert!(matches!(coordinator.recv().await, Ok(Some(Message::Ping(_)))));
+    assert!(matches!(coordinator.recv().await, Ok(None)));
+
+    let (mut near, far) = cut;
+    let whole = bytes(&hello().into());
+    near.write_all(&whole[..whole.len() - 1]).await.unwrap();
+    near.shutdown().await.unwrap();
+    let broken = accept(far, "terrafarm test", LIMIT).await;
+    assert!(matches!(broken, Err(HandshakeError::Link(LinkError::Cut))), "{broken:?}");
+}
+
+async fn garbage_is_refused_and_closed<S: Stream>((mut near, far): (S, S)) {
+    near.write_all(b"GET / HTTP/1.1\r\nHost: tower\r\n\r\n").await.unwrap();
+    let refused = accept(far, "terrafarm test", LIMIT).await;
+    assert!(matches!(refused, Err(HandshakeError::Refused { refusal: Refusal::Malformed, .. })));
+    let mut answer = Vec::new();
+    let _until_closed = near.read_to_end(&mut answer).await;
+    assert!(answer.starts_with(b"TFRM"));
+}
+
+async fn another_version_is_told_which_side_to_upgrade<S: Stream>(newer: (S, S), older: (S, S)) {
+    for (pair, versions, advice) in [
+        (newer, Versions { oldest: 7, newest: 9 }, "upgrade the coordinator"),
+        (older, Versions { oldest: 0, newest: 0 }, "upgrade the worker"),
+    ] {
+        let (near, far) = pair;
+        let (refused, refusal) = tokio::join!(
+            greet(near, Hello { versions, ..hello() }, LIMIT),
+            accept(far, "terrafarm test", LIMIT),
+        );
+        assert!(refusal.is_err());
+        match refused {
+            Err(HandshakeError::Refused { refusal: Refusal::Version, text }) => {
+                assert!(text.ends_with(advice), "{text}");
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+async fn a_long_picture_lets_heartbeats_pass<S: Stream>(pair: (S, S)) {
+    let (worker, coordinator) = connect(pair).await;
+    let (_keep, writer) = worker.split();
+    let (mut reader, _keep_too) = coordinator.split();
+    let (queue, end) = outbox(4, 4);
+    let picture = Blob { hash: BlobHash([1; 32]), bytes: vec![9; 5 * PART_BYTES].into() };
+    queue.send(picture.clone()).await.unwrap();
+    queue.send(Goodbye { reason: "done".into() }).await.unwrap();
+    let writing = tokio::spawn(writer.run(end));
+    queue.send(Ping { number: 3 }).await.unwrap();
+    drop(queue);
+    let mut order = Vec::new();
+    while let Some(message) = reader.recv().await.unwrap() {
+        order.push(message);
+    }
+    writing.await.unwrap().unwrap();
+    let ping = order.iter().position(|m| *m == Ping { number: 3 }.into()).unwrap();
+    assert!(ping <= 1, "the heartbeat came at place {ping}");
+    order.remove(ping);
+    assert_eq!(order, vec![picture.into(), Goodbye { reason: "done".into() }.into()]);
+}
+
+macro_rules! transport_suite {
+    ($name:ident, $pair:expr) => {
+        mod $name {
+            use super::*;
+
+            #[tokio::test]
+            async fn every_message_passes_both_ways() {
+                super::every_message_passes_both_ways($pair).await;
+            }
+
+            #[tokio::test]
+            async fn a_clean_end_is_told_from_a_death_inside_a_message() {
+                super::a_clean_end_is_told_from_a_death_inside_a_message($pair, $pair).await;
+            }
+
+            #[tokio::test]
+            async fn garbage_is_refused_and_closed() {
+                super::garbage_is_refused_and_closed($pair).await;
+            }
+
+            #[tokio::test]
+            async fn another_version_is_told_which_side_to_upgrade() {
+                super::another_version_is_told_which_side_to_upgrade($pair, $pair).await;
+            }
+
+            #[tokio::test]
+            async fn a_long_picture_lets_heartbeats_pass() {
+                super::a_long_picture_lets_heartbeats_pass($pair).await;
+            }
+        }
+    };
+}
+
+transport_suite!(over_memory, memory());
+transport_suite!(over_tcp, tcp().await);
+
+#[tokio::test(start_paused = true)]
+async fn a_peer_that_says_nothing_costs_one_time_limit() {
+    let (near, far) = memory();
+    let late = accept(far, "terrafarm test", LIMIT).await;
+    assert!(matches!(late, Err(HandshakeError::TimedOut(limit)) if limit == LIMIT));
+    drop(near);
+    let (near, _far) = memory();
+    let late = greet(near, hello(), LIMIT).await;
+    assert!(matches!(late, Err(HandshakeError::TimedOut(_))));
+}
+
+#[tokio::test(start_paused = true)]
+async fn silence_is_noticed_and_a_trickle_is_not_silence() {
+    let (near, far) = memory();
+    let (worker, mut coordinator) = connect((near, far)).await;
+    let (mut reader, _writer) = worker.split();
+    let silence = Duration::from_secs(3);
+    coordinator.send(&Ping { number: 1 }.into()).await.unwrap();
+    assert!(reader.recv_within(silence).await.unwrap().is_some());
+    assert!(matches!(reader.recv_within(silence).await, Err(LinkError::Silent(_))));
+
+    let (mut near, far) = memory();
+    let trickle = tokio::spawn(async move {
+        for byte in bytes(&hello().into()) {
+            near.write_all(&[byte]).await.unwrap();
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        near
+    });
+    let greeting = accept(far, "terrafarm test", LIMIT).await.unwrap();
+    assert_eq!(greeting.hello().name, "pc-1");
+    trickle.await.unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_cancelled_receive_loses_nothing() {
+    let (worker, coordinator) = connect(memory()).await;
+    let (mut reader, _keep) = worker.split();
+    let (_keep_too, mut writer) = coordinator.split();
+    let blob: Message =
+        Blob { hash: BlobHash([2; 32]), bytes: vec![1; 3 * PART_BYTES].into() }.into();
+    let sent = blob.clone();
+    let sending = tokio::spawn(async move {
+        writer.send(&sent).await.unwrap();
+        writer
+    });
+    let mut cancelled = 0;
+    let received = loop {
+        tokio::select! {
+            biased;
+            message = reader.recv() => break message.unwrap().unwrap(),
+            () = tokio::task::yield_now() => cancelled += 1,
+        }
+    };
+    assert_eq!(received, blob);
+    assert!(cancelled > 3, "cancelled {cancelled} times");
+    sending.await.unwrap();
+}
+
+#[tokio::test]
+async fn a_full_queue_says_so_and_a_closed_one_too() {
+    let (queue, end) = outbox(1, 1);
+    assert_eq!(queue.try_send(Ping { number: 1 }), Ok(()));
+    assert_eq!(queue.try_send(Ping { number: 2 }), Err(Unsent::Full));
+    assert!(queue.try_send(Goodbye { reason: String::new() }).is_ok(), "the other lane has room");
+    drop(end);
+    assert_eq!(queue.try_send(Ping { number: 3 }), Err(Unsent::Closed));
+    assert!(matches!(queue.send(Ping { number: 3 }).await, Err(LinkError::Closed)));
+}
