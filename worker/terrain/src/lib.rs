@@ -10,6 +10,7 @@
 //! grids of one kind; level 0 of a layer is its finest grid.
 
 pub mod build;
+pub mod cache;
 pub mod codec;
 pub mod color;
 #[cfg(test)]
@@ -19,5 +20,6 @@ mod planes;
 mod positioned;
 mod pyramid;
 pub mod resident;
+pub mod sample;
 pub mod store;
 pub mod tile;
