@@ -1,1 +1,3 @@
 //! The coordinator: driver task, peers, sinks.
+
+pub mod sink;
