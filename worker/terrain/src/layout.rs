@@ -19,6 +19,9 @@ pub const TILE_CELLS: usize = 256;
 pub const TILE_RING: usize = 1;
 /// Posts along a side of a tile as stored: −1 ..= 257.
 pub const TILE_POSTS: usize = TILE_CELLS + 1 + 2 * TILE_RING;
+/// The largest height of a post above or below the datum, metres. What lies beyond is
+/// no terrain but a fill value that a file forgot to name; such a post is void.
+pub const MAX_HEIGHT_M: f32 = 1e7;
 /// The largest number of posts along a side of a layer: 2^26, 67 million.
 pub const MAX_POSTS: u64 = 1 << 26;
 /// The largest number of layers.
@@ -95,8 +98,8 @@ pub struct Level {
 /// One tile as the index knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TileEntry {
-    /// SHA-256 of the encoded tile. All zero for a tile without a single valid post,
-    /// which has no bytes.
+    /// SHA-256 of the encoded tile. All zero for a tile without a single valid post (its
+    /// ring left out), which has no bytes.
     pub hash: BlobHash,
     /// Position of the encoded tile in the store file, bytes.
     pub offset: u64,
@@ -267,12 +270,13 @@ impl Layer {
             if level.tiles != tiles || level.entries.len() as u64 != expected {
                 return Err(format!("level {number} has the wrong number of tiles"));
             }
-            if level
-                .entries
-                .iter()
-                .any(|e| e.min.is_nan() || e.max.is_nan() || e.deviation.is_nan())
-            {
-                return Err(format!("level {number} has a bound that is not a number"));
+            let sound = |e: &TileEntry| {
+                (e.is_empty()
+                    || (-MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M))
+                    && e.deviation >= 0.0
+            };
+            if !level.entries.iter().all(sound) {
+                return Err(format!("level {number} has a bound that is out of range"));
             }
         }
         Ok(())

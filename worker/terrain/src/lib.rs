@@ -9,6 +9,15 @@
 //! posts; a *tile* is [`layout::TILE_CELLS`] cells a side; a *layer* is a pyramid of
 //! grids of one kind; level 0 of a layer is its finest grid.
 
+pub mod build;
+pub mod codec;
+pub mod color;
+#[cfg(test)]
+mod fixture;
 pub mod layout;
+mod planes;
+mod positioned;
+mod pyramid;
 pub mod resident;
+pub mod store;
 pub mod tile;

@@ -17,6 +17,14 @@ pub enum Tile {
 }
 
 impl Tile {
+    /// Heights or photo.
+    pub fn kind(&self) -> LayerKind {
+        match self {
+            Tile::Height(_) => LayerKind::Height,
+            Tile::Photo(_) => LayerKind::Photo,
+        }
+    }
+
     /// Bytes the tile takes in memory.
     pub fn memory_bytes(&self) -> usize {
         match self {
