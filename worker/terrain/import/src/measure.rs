@@ -3,7 +3,7 @@
 //! Both are bilinear, on different posts. They are compared at every sample of the
 //! inputs, halfway between neighbours and in the middle of every cell, wherever the
 //! input is the topmost one with a height and the store has one, too. Positions are
-//! good to [`POSITION_SLACK`] of a post; what that can make up on the cell concerned is
+//! good to [`POSITION_SLACK`] of a post; what that can make up on the slope concerned is
 //! added, so that whoever samples the store finds no larger error.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -154,7 +154,7 @@ impl Probe<'_> {
         let frame = self.grid.affine();
         let mut positions: Vec<[f64; 2]> = posts.iter().map(|&post| frame.at(post)).collect();
         self.drop_hidden(&mut positions)?;
-        self.compare(&positions, &expected)
+        self.compare(&positions, &expected, halves.width)
     }
 
     /// Makes positions NaN at which a mosaic further up has a height.
@@ -184,34 +184,34 @@ impl Probe<'_> {
         Ok(())
     }
 
-    fn compare(&self, positions: &[[f64; 2]], expected: &[f32]) -> Result<Errors, ImportError> {
+    fn compare(
+        &self,
+        positions: &[[f64; 2]],
+        expected: &[f32],
+        columns: usize,
+    ) -> Result<Errors, ImportError> {
         let layers = &self.measurement.layers;
         let found = surface_at(layers, positions)?;
-        // The surface a thousandth of a post to the north-east bounds what the
-        // uncertainty of the position can make up, twofold.
-        let shifted: Vec<[f64; 2]> = positions
-            .iter()
-            .map(|p| [0, 1].map(|axis| p[axis] + PROBE * self.grid.spacing[axis]))
-            .collect();
-        let nearby = surface_at(layers, &shifted)?;
         let mut errors = Errors::default();
-        for ((&found, &nearby), &expected) in found.iter().zip(&nearby).zip(expected) {
-            let error = (f64::from(found) - f64::from(expected)).abs();
+        for (n, (&found, &here)) in found.iter().zip(expected).enumerate() {
+            let error = (f64::from(found) - f64::from(here)).abs();
             if error.is_nan() {
                 continue;
             }
-            let slope = (f64::from(nearby) - f64::from(found)).abs();
-            let slack = if slope.is_nan() { 0.0 } else { 2.0 * slope * POSITION_SLACK / PROBE };
-            errors.max_m = errors.max_m.max(error + slack);
+            // Change of the input per sample along both axes, where it can be seen.
+            let change = |step: usize| {
+                let next = if n >= step { expected[n - step] } else { here };
+                let change = 2.0 * (f64::from(here) - f64::from(next)).abs();
+                if change.is_nan() { 0.0 } else { change }
+            };
+            let slack = (change(1) + change(columns)) * POSITION_SLACK;
+        errors.max_m = errors.max_m.max(error + slack);
             errors.sum_of_squares += error * error;
             errors.count += 1;
         }
         Ok(errors)
     }
 }
-
-/// Distance over which slopes are taken, posts.
-const PROBE: f64 = 0.25;
 
 /// The bilinear surface of samples at every half column and row.
 fn half_samples(samples: &[f32], [width, height]: [usize; 2]) -> Vec<f32> {

@@ -5,4 +5,16 @@
 //! unless their format leaves no choice, and nothing is allocated for before the declared
 //! size has been checked against the file's length and a named limit.
 
+mod blocks;
 pub mod info;
+pub mod limits;
+mod open;
+pub mod options;
+mod sidecar;
+pub mod source;
+pub mod tiff;
+
+pub use info::{Content, GeoTransform, Raster, RasterError, RasterInfo, Vertical, Window};
+pub use open::{open, open_source};
+pub use options::{HeightUnit, OpenOptions, PngEncoding};
+pub use source::{Sidecars, Source};
