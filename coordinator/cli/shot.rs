@@ -6,17 +6,18 @@ use crate::progress;
 use anyhow::{Context, anyhow};
 use indicatif::ProgressBar;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 use terrafarm_common::camera::Camera;
-use terrafarm_common::id::FrameIndex;
+use terrafarm_common::id::{BlobHash, FrameIndex};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_coordinator::client::{self, ClientError, FrameFacts, Submission, Update};
-use terrafarm_coordinator::sink::manifest::{FrameRecord, Manifest, WorkerRecord};
+use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
+use terrafarm_film::OrderedFrames;
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
 use terrafarm_terrain::store::StoreReader;
 use tokio::sync::mpsc;
@@ -34,6 +35,10 @@ pub struct Plan {
     pub name: String,
     /// The scene as the user named it, for the manifest.
     pub scene: PathBuf,
+    /// What stood in it.
+    pub scene_sha256: BlobHash,
+    /// The flight as the user named it, for the manifest.
+    pub flight: PathBuf,
     /// Its terrain.
     pub store: Arc<StoreReader>,
     /// Light, air and sky.
@@ -156,9 +161,13 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let manifest = Manifest {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),
         scene: plan.scene.display().to_string(),
-        store: plan.store.index_blob().0.to_hex(),
+        scene_sha256: plan.scene_sha256.to_hex(),
+        terrain: plan.store.path().display().to_string(),
+        terrain_sha256: plan.store.index_blob().0.to_hex(),
+        flight: Some(plan.flight.display().to_string()),
+        output: finished.output.display().to_string(),
         method: plan.quality.method.name().to_owned(),
-        samples_per_side: plan.quality.samples_per_side,
+        samples: plan.quality.samples_per_side,
         tolerance_px: None,
         size: [spec.width, spec.height],
         fps: plan.fps,
@@ -167,22 +176,15 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         workers: done
             .workers
             .iter()
-            .map(|share| WorkerRecord {
+            .map(|share| WorkerEntry {
                 name: share.name.clone(),
                 jobs: share.jobs,
                 render_ms: share.cost_us as f64 / 1e3,
             })
             .collect(),
     };
-    let manifest_path = manifest_beside(&finished.output);
-    manifest.save(&manifest_path)?;
+    let manifest_path = manifest.save(&finished.output)?;
     Ok(Report { finished, manifest_path, manifest, seconds: started.elapsed().as_secs_f64() })
-}
-
-/// `manifest.json` in the folder of the pictures or of the video.
-fn manifest_beside(output: &Path) -> PathBuf {
-    let folder = if output.is_dir() { Some(output) } else { output.parent() };
-    folder.unwrap_or(Path::new(".")).join("manifest.json")
 }
 
 /// Puts frames in order and into the sink.
@@ -196,7 +198,7 @@ struct Desk {
 #[derive(Default)]
 struct Written {
     finished: Option<Finished>,
-    records: Vec<FrameRecord>,
+    records: Vec<FrameEntry>,
     failed: BTreeMap<FrameIndex, String>,
 }
 
@@ -207,33 +209,29 @@ impl Desk {
         mut inbox: mpsc::Receiver<Update>,
         taken: &mpsc::Sender<FrameIndex>,
     ) -> anyhow::Result<Written> {
-        let mut waiting: BTreeMap<FrameIndex, Option<(Rgb8, FrameFacts)>> = BTreeMap::new();
+        let mut order = OrderedFrames::new(self.spec.frames as usize);
         let mut written = Written::default();
-        let mut next = 0;
         while let Some(update) = inbox.blocking_recv() {
             match update {
                 Update::Progress(progress) => {
                     self.bar.set_message(format!("on {} workers", progress.workers));
                 }
-                Update::Frame(index, picture, facts) => {
-                    waiting.insert(index, Some((picture, facts)));
-                }
+                Update::Frame(index, picture, facts) => order.put(index, Some((picture, facts)))?,
                 Update::FrameFailed(index, reason) => {
-                    let index_in_flight = self.first + index;
-                    self.bar.suspend(|| eprintln!("frame {index_in_flight} failed: {reason}"));
-                    written.failed.insert(index_in_flight, reason);
-                    waiting.insert(index, None);
+                    let number = self.first + index;
+                    self.bar.suspend(|| eprintln!("frame {number} failed: {reason}"));
+                    written.failed.insert(number, reason);
+                    order.put(index, None)?;
                 }
             }
-            while let Some(frame) = waiting.remove(&next) {
-                self.put(sink.as_mut(), next, frame, &mut written)?;
+            while let Some((index, frame)) = order.take() {
+                self.put(sink.as_mut(), index, frame, &mut written)?;
                 // The shot may be over by now; then nobody needs to know.
-                let _ = taken.blocking_send(next);
-                next += 1;
+                let _ = taken.blocking_send(index);
                 self.bar.inc(1);
             }
         }
-        if next == self.spec.frames {
+        if order.next() == self.spec.frames {
             self.bar.set_message("finishing the file");
             written.finished = Some(sink.finish()?);
         }
@@ -248,22 +246,24 @@ impl Desk {
         written: &mut Written,
     ) -> anyhow::Result<()> {
         let Some((picture, facts)) = frame else {
-            sink.put(self.first + index, &marked(self.spec.width, self.spec.height))?;
+            sink.put(index, &marked(self.spec.width, self.spec.height))?;
             return Ok(());
         };
-        sink.put(self.first + index, &picture)?;
+        sink.put(index, &picture)?;
         if let Some((poster, path)) = &self.poster
             && *poster == index
         {
             sink::poster::save(path, &picture)?;
         }
-        written.records.push(FrameRecord {
+        written.records.push(FrameEntry {
             index: self.first + index,
             sha256: sink::pixels_sha256(&picture).to_hex(),
             ms: facts.elapsed_us as f64 / 1e3,
             render_ms: facts.cost_us as f64 / 1e3,
             jobs: facts.jobs,
             below_ground: facts.below_ground,
+            error_px_p99: None,
+            mismatch: None,
         });
         Ok(())
     }

@@ -13,8 +13,8 @@ use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
 use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox};
 use terrafarm_wire::message::{
-    Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong, Progress,
-    Role, ShotDone, Submit, WantBlobs,
+    Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
+    Progress, Role, ShotDone, Submit, WantBlobs,
 };
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
@@ -200,7 +200,8 @@ struct Talk {
 
 impl Talk {
     fn new(submission: &Submission) -> Self {
-        let size = submission.cameras.first().map_or((0, 0), |camera| (camera.width, camera.height));
+        let size =
+            submission.cameras.first().map_or((0, 0), |camera| (camera.width, camera.height));
         Talk { id: None, size, frames: submission.cameras.len() as u64, seen: 0, done: None }
     }
 

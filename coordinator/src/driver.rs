@@ -186,7 +186,8 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
             // At most as many at once as frames may be in flight.
             tokio::task::spawn_blocking(move || {
                 let pixels = picture.into_pixels().into();
-                let packed = if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };
+                let packed =
+                    if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };
                 match packed {
                     Ok(pixels) => drop(outbox.try_send(head.with(pixels))),
                     Err(why) => tracing::error!("cannot pack a frame: {why}"),

@@ -1,17 +1,16 @@
 //! The coordinator's mind: what each message means, and what is to be sent.
 //!
-//! [`Farm`] joins the scheduler, the film and the blob broker. It takes events of peers
+//! [`Farm`] joins the scheduler, the shots with their film, and the blob broker. It takes events of peers
 //! and a time, and leaves messages in a queue; it reads no clock and knows no socket. The
 //! driver task (`driver.rs`) owns it and carries the messages.
 
 use crate::blobs::{Broker, ClientId, Order};
-use crate::shots::{FrameHead, Granted, Shot, Shots};
+use crate::shots::{FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
-use terrafarm_film::{Film, Merge};
-use terrafarm_terrain::store::hash_of;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
+use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::limits::clip_reason;
 use terrafarm_wire::message::{
     Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
@@ -65,7 +64,6 @@ pub enum Out {
 /// Everything the coordinator knows.
 pub struct Farm {
     scheduler: Scheduler,
-    film: Film,
     broker: Broker,
     workers: BTreeMap<WorkerId, WorkerState>,
     clients: BTreeMap<ClientId, Greeting>,
@@ -90,7 +88,6 @@ impl Farm {
     pub fn new(scheduler: terrafarm_sched::Config, seed: u64, blob_memory_bytes: usize) -> Self {
         Farm {
             scheduler: Scheduler::new(scheduler, seed),
-            film: Film::new(),
             broker: Broker::new(blob_memory_bytes),
             workers: BTreeMap::new(),
             clients: BTreeMap::new(),
@@ -270,7 +267,8 @@ impl Farm {
             .filter_map(|shot| self.shots.get(*shot).map(|shot| shot.client))
             .collect();
         let owners: Vec<_> = owners.into_iter().collect();
-        let orders = want.hashes.iter().filter_map(|&hash| self.broker.wanted(worker, hash, &owners));
+        let orders =
+            want.hashes.iter().filter_map(|&hash| self.broker.wanted(worker, hash, &owners));
         let orders = orders.collect();
         self.carry_out(orders);
     }
@@ -324,10 +322,8 @@ impl Farm {
                 let name =
                     self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
                 self.shots.count_job(shot, frame, name, &done.report);
-                match self.film.merge((shot, frame), region, &pixels) {
-                    Ok(Merge::Complete(picture)) => self.shots.keep(shot, frame, picture),
-                    Ok(Merge::Partial) => {}
-                    Err(why) => tracing::error!(%shot, frame, "cannot merge pixels: {why}"),
+                if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
+                    tracing::error!(%shot, "cannot merge pixels: {why}");
                 }
             }
             (Some(Action::Refuse { why, .. }), _) => {
@@ -359,7 +355,6 @@ impl Farm {
                 Action::FrameComplete { shot, frame } => self.finish_frame(now, shot, frame),
                 Action::FrameFailed { shot, frame, reason } => {
                     tracing::warn!(%shot, frame, "frame failed: {reason}");
-                    self.film.discard((shot, frame));
                     if let Some(state) = self.shots.frame_failed(shot, frame) {
                         let peer = Peer::Client(state.client);
                         let reason = clip_reason(&reason.to_string());
@@ -420,9 +415,7 @@ impl Farm {
             width: state.submit.width,
             height: state.submit.height,
         });
-        let size = (state.submit.width, state.submit.height);
         worker_state.leases.insert(lease);
-        self.film.open((shot, frame), size.0, size.1);
         self.granted.insert(lease, granted);
         if let Some(open) = open {
             self.send(Peer::Worker(worker), open);
@@ -473,10 +466,8 @@ impl Farm {
     }
 
     fn forget_shot(&mut self, shot: ShotId) {
-        let Some(state) = self.shots.remove(shot) else { return };
-        let Shot { open_frames, .. } = state;
-        for frame in open_frames.keys() {
-            self.film.discard((shot, *frame));
+        if self.shots.remove(shot).is_none() {
+            return;
         }
         let told: Vec<_> = self
             .workers

@@ -6,6 +6,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::region::Region;
+use terrafarm_film::{Film, FilmError, Merge};
 use terrafarm_sched::{Event, Micros};
 use terrafarm_wire::limits::WORKER_SHARES_MAX;
 use terrafarm_wire::message::{
@@ -47,8 +48,10 @@ pub struct Shot {
     pub frames_done: u32,
     /// Frames given up.
     pub frames_failed: u32,
+    /// Where its pixels are merged.
+    film: Film,
     /// Frames begun and not finished.
-    pub open_frames: BTreeMap<FrameIndex, OpenFrame>,
+    open_frames: BTreeMap<FrameIndex, OpenFrame>,
     jobs: u64,
     jobs_granted: u64,
     report: RenderReport,
@@ -121,6 +124,7 @@ impl Shots {
             progress_at: now,
             frames_done: 0,
             frames_failed: 0,
+            film: Film::new(submit.frames_in_flight as usize),
             open_frames: BTreeMap::new(),
             jobs: 0,
             jobs_granted: 0,
@@ -180,6 +184,13 @@ impl Shots {
     pub fn begin_frame(&mut self, shot: ShotId, frame: FrameIndex, now: Micros) -> Option<&Shot> {
         let state = self.shots.get_mut(&shot)?;
         state.jobs_granted += 1;
+        if !state.film.is_open(frame) {
+            let (width, height) = (state.submit.width, state.submit.height);
+            if let Err(why) = state.film.open(frame, width, height) {
+                tracing::error!(%shot, "{why}");
+                return None;
+            }
+        }
         state.open_frames.entry(frame).or_insert_with(|| OpenFrame {
             since: now,
             jobs: 0,
@@ -213,13 +224,25 @@ impl Shots {
         }
     }
 
-    /// Keeps a merged picture until the scheduler says that its frame is complete.
-    pub fn keep(&mut self, shot: ShotId, frame: FrameIndex, picture: Rgb8) {
-        if let Some(open) =
-            self.shots.get_mut(&shot).and_then(|state| state.open_frames.get_mut(&frame))
+    /// Puts pixels in their place. A picture that is whole is kept until the scheduler
+    /// says that its frame is complete.
+    ///
+    /// # Errors
+    /// If they do not fit; nothing is changed then.
+    pub fn merge(
+        &mut self,
+        shot: ShotId,
+        frame: FrameIndex,
+        region: Region,
+        pixels: &[u8],
+    ) -> Result<(), FilmError> {
+        let Some(state) = self.shots.get_mut(&shot) else { return Ok(()) };
+        if let Merge::Complete(picture) = state.film.merge(frame, region, pixels)?
+            && let Some(open) = state.open_frames.get_mut(&frame)
         {
             open.picture = Some(picture);
         }
+        Ok(())
     }
 
     /// A frame is complete: its message (still without pixels) and its picture.
@@ -246,6 +269,7 @@ impl Shots {
     pub fn frame_failed(&mut self, shot: ShotId, frame: FrameIndex) -> Option<&Shot> {
         let state = self.shots.get_mut(&shot)?;
         state.open_frames.remove(&frame);
+        state.film.discard(frame);
         state.frames_failed += 1;
         Some(state)
     }

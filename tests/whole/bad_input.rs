@@ -74,7 +74,11 @@ fn a_file_of_no_known_format_lists_the_known_ones() {
 fn a_missing_file_is_named() {
     let dir = Dir::new();
     let (_, stderr) = run(
-        terrafarm().args(["terrain", "import"]).arg(dir.path("nowhere.tif")).arg("-o").arg(dir.path("x.terrain")),
+        terrafarm()
+            .args(["terrain", "import"])
+            .arg(dir.path("nowhere.tif"))
+            .arg("-o")
+            .arg(dir.path("x.terrain")),
         2,
     );
     assert!(stderr.contains("nowhere.tif"), "{stderr}");
@@ -156,7 +160,8 @@ fn a_scene_with_an_unknown_key_is_refused_with_its_line() {
 #[test]
 fn an_unknown_method_lists_the_known_ones() {
     let world = World::new(40);
-    let (_, stderr) = run(world.render().args(["--method", "exat", "-o"]).arg(world.dir.path("o")), 2);
+    let (_, stderr) =
+        run(world.render().args(["--method", "exat", "-o"]).arg(world.dir.path("o")), 2);
     assert!(stderr.contains("exact"), "{stderr}");
 }
 
@@ -179,10 +184,8 @@ fn a_coordinator_open_to_the_network_must_be_asked_for() {
 #[test]
 fn an_output_that_cannot_be_written_is_said_before_rendering() {
     let world = World::new(40);
-    let (_, stderr) = run(
-        world.render().args(["--workers", "1", "-o", "/proc/terrafarm-nowhere/out.mp4"]),
-        2,
-    );
+    let (_, stderr) =
+        run(world.render().args(["--workers", "1", "-o", "/proc/terrafarm-nowhere/out.mp4"]), 2);
     assert!(stderr.contains("/proc/terrafarm-nowhere"), "{stderr}");
 }
 
@@ -197,7 +200,16 @@ fn a_full_disk_is_said_and_leaves_nothing() {
     }
     let world = World::new(40);
     let (_, stderr) = run(
-        world.render().args(["--size", "64x36", "--frames", "0..2", "--workers", "1", "-o", "/dev/full/out.mp4"]),
+        world.render().args([
+            "--size",
+            "64x36",
+            "--frames",
+            "0..2",
+            "--workers",
+            "1",
+            "-o",
+            "/dev/full/out.mp4",
+        ]),
         2,
     );
     assert!(stderr.contains("/dev/full"), "{stderr}");

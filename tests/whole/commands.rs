@@ -16,7 +16,10 @@ fn oracle(program: &str) -> bool {
         .status()
         .is_ok();
     if !here {
-        assert!(std::env::var_os("TERRAFARM_REQUIRE_ORACLES").is_none(), "{program} is not on PATH");
+        assert!(
+            std::env::var_os("TERRAFARM_REQUIRE_ORACLES").is_none(),
+            "{program} is not on PATH"
+        );
         println!("skipped: {program} is not on PATH");
     }
     here
@@ -27,20 +30,23 @@ fn a_png_sequence_is_numbered_and_has_a_manifest() {
     let world = World::new(60);
     let output = world.dir.path("pictures");
     succeed(
-        world.render().args(["--size", "64x36", "--frames", "0..3", "--workers", "1", "-o"]).arg(&output),
+        world
+            .render()
+            .args(["--size", "64x36", "--frames", "0..3", "--workers", "1", "-o"])
+            .arg(&output),
     );
     let mut names: Vec<_> = fs::read_dir(&output)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
     names.sort();
-    assert_eq!(names, ["00000.png", "00001.png", "00002.png", "manifest.json"]);
+    assert_eq!(names, ["frame_00000.png", "frame_00001.png", "frame_00002.png", "manifest.json"]);
     let manifest: serde_json::Value =
         serde_json::from_slice(&fs::read(output.join("manifest.json")).unwrap()).unwrap();
     assert_eq!(manifest["size"], serde_json::json!([64, 36]));
     assert_eq!(manifest["method"], "exact");
     assert_eq!(manifest["frames"].as_array().unwrap().len(), 3);
-    let picture = read_png(&output.join("00001.png"));
+    let picture = read_png(&output.join("frame_00001.png"));
     assert_eq!(
         manifest["frames"][1]["sha256"].as_str().unwrap(),
         hex(&<sha2::Sha256 as sha2::Digest>::digest(&picture.2))
@@ -82,13 +88,10 @@ fn mp4_and_y4m_hold_the_frames_and_their_colours() {
         let frame_bytes = 192 * 108 * 3;
         assert_eq!(raw.stdout.len(), 5 * frame_bytes, "{name}");
         for index in 0..5 {
-            let (_, _, truth) = read_png(&pictures.join(format!("{index:05}.png")));
+            let (_, _, truth) = read_png(&pictures.join(format!("frame_{index:05}.png")));
             let shown = &raw.stdout[index * frame_bytes..][..frame_bytes];
-            let squares: f64 = truth
-                .iter()
-                .zip(shown)
-                .map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2))
-                .sum();
+            let squares: f64 =
+                truth.iter().zip(shown).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
             let psnr = 10.0 * (255.0f64.powi(2) * frame_bytes as f64 / squares.max(1.0)).log10();
             assert!(psnr > 28.0, "{name} frame {index}: {psnr:.1} dB");
         }
@@ -111,8 +114,12 @@ fn sampling_reads_columns_in_any_order_and_leaves_voids_empty() {
             .arg("-o")
             .arg(&store),
     );
-    let points = dir.write("p.csv", "name,y,x\nsw,5000000,500000\nmid,5000005,500005\nvoid,5000010,500020\nfar,0,0\n");
-    let csv = succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&points));
+    let points = dir.write(
+        "p.csv",
+        "name,y,x\nsw,5000000,500000\nmid,5000005,500005\nvoid,5000010,500020\nfar,0,0\n",
+    );
+    let csv =
+        succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&points));
     let lines: Vec<_> = csv.lines().collect();
     assert_eq!(lines[0], "name,y,x,height_m");
     assert_eq!(lines[1], "sw,5000000,500000,4");
@@ -138,7 +145,11 @@ fn info_is_readable_by_people_and_scripts() {
 fn the_same_seed_makes_the_same_store() {
     let dir = Dir::new();
     for name in ["a.terrain", "b.terrain"] {
-        succeed(terrafarm().args(["terrain", "synth", "--size", "130", "--seed", "3", "-o"]).arg(dir.path(name)));
+        succeed(
+            terrafarm()
+                .args(["terrain", "synth", "--size", "130", "--seed", "3", "-o"])
+                .arg(dir.path(name)),
+        );
     }
     assert!(fs::read(dir.path("a.terrain")).unwrap() == fs::read(dir.path("b.terrain")).unwrap());
 }
@@ -156,7 +167,12 @@ fn the_simulator_keeps_its_promises_for_a_few_seeds() {
                 .arg(&json),
         );
         let report: serde_json::Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
-        let broken: Vec<_> = report["invariants"].as_object().unwrap().iter().filter(|(_, n)| n.as_u64() != Some(0)).collect();
+        let broken: Vec<_> = report["invariants"]
+            .as_object()
+            .unwrap()
+            .iter()
+            .filter(|(_, n)| n.as_u64() != Some(0))
+            .collect();
         assert!(broken.is_empty(), "seed {seed}: {broken:?}");
     }
 }
@@ -214,18 +230,25 @@ fn real_terrain_imports_and_agrees_with_gdal_within_the_reported_error() {
         let points: Vec<_> = (0..400)
             .map(|n| {
                 let (a, b) = (f64::from(n % 20) / 19.0, f64::from(n / 20) / 19.0);
-                [west + (east - west) * (0.013 + 0.97 * a), south + (north - south) * (0.017 + 0.96 * b)]
+                [
+                    west + (east - west) * (0.013 + 0.97 * a),
+                    south + (north - south) * (0.017 + 0.96 * b),
+                ]
             })
             .collect();
         let truth = gdal_heights(&data.join(name), &points);
         let csv: String = points.iter().map(|[lon, lat]| format!("{lon},{lat}\n")).collect();
         let list = dir.write("points.csv", format!("lon,lat\n{csv}"));
-        let sampled = succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&list));
+        let sampled =
+            succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&list));
         let mut compared = 0;
         for (line, truth) in sampled.lines().skip(1).zip(&truth) {
             let height: Option<f64> = line.rsplit(',').next().unwrap().parse().ok();
             if let (Some(height), Some(truth)) = (height, truth) {
-                assert!((height - truth).abs() <= reported, "{name}: {line}, gdal says {truth}, reported {reported}");
+                assert!(
+                    (height - truth).abs() <= reported,
+                    "{name}: {line}, gdal says {truth}, reported {reported}"
+                );
                 compared += 1;
             }
         }
@@ -237,7 +260,13 @@ fn real_terrain_imports_and_agrees_with_gdal_within_the_reported_error() {
 fn a_hillshade_can_be_looked_at() {
     let world = World::new(100);
     let picture = world.dir.path("shade.png");
-    succeed(terrafarm().args(["terrain", "hillshade"]).arg(world.dir.path("land.terrain")).arg("-o").arg(&picture));
+    succeed(
+        terrafarm()
+            .args(["terrain", "hillshade"])
+            .arg(world.dir.path("land.terrain"))
+            .arg("-o")
+            .arg(&picture),
+    );
     let (width, height, pixels) = read_png(&picture);
     assert_eq!((width, height), (100, 100));
     let inner: Vec<_> = pixels.iter().filter(|&&grey| grey > 0).collect();
@@ -246,7 +275,9 @@ fn a_hillshade_can_be_looked_at() {
 
 #[test]
 fn help_and_version_end_well() {
-    for arguments in [&["--help"][..], &["--version"], &["render", "--help"], &["terrain", "import", "--help"]] {
+    for arguments in
+        [&["--help"][..], &["--version"], &["render", "--help"], &["terrain", "import", "--help"]]
+    {
         succeed(terrafarm().args(arguments));
     }
     run(terrafarm().arg("fly-me-to-the-moon"), 2);

@@ -54,7 +54,8 @@ fn every_terrafarm_command_in_the_documents_is_understood() {
 #[test]
 fn the_test_command_of_the_readme_is_the_one_that_ci_runs() {
     let ci = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(".ci/run")).unwrap();
-    let tests = commands_in("README.md").into_iter().find(|command| command.starts_with("cargo test"));
+    let tests =
+        commands_in("README.md").into_iter().find(|command| command.starts_with("cargo test"));
     let tests = tests.expect("the README says how to run the tests");
     assert!(ci.contains(&tests), "{tests}");
 }

@@ -38,7 +38,11 @@ fn undisturbed_and_on_farm(world: &World, address: &str) -> (Vec<String>, Runnin
     succeed(world.render().args(SIZE).args(["--workers", "1", "-o"]).arg(&calm));
     let output = world.dir.path("farm");
     let render = Running::start(
-        world.render().args(SIZE).args(["--split", "tiles:32", "--coordinator", address, "-o"]).arg(&output),
+        world
+            .render()
+            .args(SIZE)
+            .args(["--split", "tiles:32", "--coordinator", address, "-o"])
+            .arg(&output),
     );
     (frame_hashes(&calm.join("manifest.json")), render)
 }
@@ -158,7 +162,10 @@ fn a_worker_that_comes_in_mid_shot_is_used() {
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
     let workers = manifest["workers"].as_array().unwrap();
     for name in ["first", "second"] {
-        let one = workers.iter().find(|w| w["name"] == name).unwrap_or_else(|| panic!("{name} is missing"));
+        let one = workers
+            .iter()
+            .find(|w| w["name"] == name)
+            .unwrap_or_else(|| panic!("{name} is missing"));
         assert!(one["jobs"].as_u64().unwrap() > 0, "{one}");
     }
 }

@@ -49,8 +49,7 @@ pub fn terrafarm() -> Command {
 /// Runs to the end and returns what was printed; fails the test on another exit code.
 pub fn run(command: &mut Command, code: i32) -> (String, String) {
     let Output { status, stdout, stderr } = command.output().unwrap();
-    let (stdout, stderr) =
-        (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
+    let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
     assert_eq!(
         status.code(),
         Some(code),
@@ -82,7 +81,8 @@ impl World {
                 .arg("-o")
                 .arg(&store),
         );
-        let scene = dir.write("scene.toml", "terrain = \"land.terrain\"\n[haze]\nvisibility_km = 40\n");
+        let scene =
+            dir.write("scene.toml", "terrain = \"land.terrain\"\n[haze]\nvisibility_km = 40\n");
         let span = f64::from(posts - 1) * 30.0;
         let flight = dir.write(
             "flight.csv",
@@ -124,8 +124,7 @@ pub struct Running {
 
 impl Running {
     pub fn start(command: &mut Command) -> Self {
-        let mut child =
-            command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let (sender, lines) = channel();
         let stdout: ChildStdout = child.stdout.take().unwrap();
         let stderr = child.stderr.take().unwrap();
@@ -155,7 +154,11 @@ impl Running {
                     }
                 }
                 Err(why) => {
-                    let how = if why == RecvTimeoutError::Timeout { "did not come" } else { "ended before" };
+                    let how = if why == RecvTimeoutError::Timeout {
+                        "did not come"
+                    } else {
+                        "ended before"
+                    };
                     panic!("{text:?} {how}; lines so far:\n{}", self.seen.join("\n"));
                 }
             }
@@ -201,7 +204,8 @@ impl Drop for Running {
 
 /// A coordinator of its own process, and its address.
 pub fn coordinator() -> (Running, String) {
-    let mut running = Running::start(terrafarm().args(["-v", "coordinator", "--listen", "127.0.0.1:0"]));
+    let mut running =
+        Running::start(terrafarm().args(["-v", "coordinator", "--listen", "127.0.0.1:0"]));
     let line = running.expect("coordinator on ");
     let address = line.rsplit(' ').next().unwrap().to_owned();
     (running, address)
@@ -210,7 +214,16 @@ pub fn coordinator() -> (Running, String) {
 /// A worker of its own process, one thread, no disk cache.
 pub fn worker(address: &str, name: &str) -> Running {
     Running::start(terrafarm().args([
-        "-vv", "worker", "--coordinator", address, "--threads", "1", "--cache-limit", "0", "--name", name,
+        "-vv",
+        "worker",
+        "--coordinator",
+        address,
+        "--threads",
+        "1",
+        "--cache-limit",
+        "0",
+        "--name",
+        name,
     ]))
 }
 

@@ -96,8 +96,21 @@ fn logic_reads_no_clock() {
 fn pixels_use_no_platform_maths() {
     // sin, exp and pow of the platform differ between systems in the last bit; fused
     // multiply-add differs between processors. A frame must not.
-    let banned = [".sin()", ".cos()", ".tan()", ".exp()", ".powf(", ".powi(", ".ln()", ".mul_add(", ".atan2(", ".exp2("];
-    for folder in ["worker/raycast/src", "worker/terrain/src", "worker/terrain/synth/src", "common/src"] {
+    let banned = [
+        ".sin()",
+        ".cos()",
+        ".tan()",
+        ".exp()",
+        ".powf(",
+        ".powi(",
+        ".ln()",
+        ".mul_add(",
+        ".atan2(",
+        ".exp2(",
+    ];
+    for folder in
+        ["worker/raycast/src", "worker/terrain/src", "worker/terrain/synth/src", "common/src"]
+    {
         for (path, text) in sources(&root().join(folder)) {
             let code = text.split("#[cfg(test)]").next().unwrap();
             if path.components().any(|part| part.as_os_str() == "tests_support.rs") {
@@ -120,9 +133,14 @@ fn pixels_use_no_platform_maths() {
 
 #[test]
 fn every_top_level_document_exists() {
-    for name in
-        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"]
-    {
+    for name in [
+        "README.md",
+        "ARCHITECTURE.md",
+        "CONTRIBUTING.md",
+        "CHANGELOG.md",
+        "LICENSE-MIT",
+        "LICENSE-APACHE",
+    ] {
         assert!(root().join(name).is_file(), "{name} is missing");
     }
 }

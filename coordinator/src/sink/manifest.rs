@@ -4,6 +4,7 @@
 use super::SinkError;
 use super::beside::Beside;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use terrafarm_common::id::FrameIndex;
 
@@ -36,8 +37,23 @@ pub struct Manifest {
     pub size: [u32; 2],
     /// Frames per second.
     pub fps: f64,
-    /// The frames, in order.
+    /// The frames, in order; those that failed are left out.
     pub frames: Vec<FrameEntry>,
+    /// Frames that could not be rendered, and why.
+    pub failed: BTreeMap<FrameIndex, String>,
+    /// Who rendered.
+    pub workers: Vec<WorkerEntry>,
+}
+
+/// What one worker did.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WorkerEntry {
+    /// Its name.
+    pub name: String,
+    /// Jobs whose pixels were used.
+    pub jobs: u64,
+    /// Time it rendered for them, milliseconds.
+    pub render_ms: f64,
 }
 
 /// One frame.
@@ -49,6 +65,12 @@ pub struct FrameEntry {
     pub sha256: String,
     /// From the first lease of the frame to its last pixel, milliseconds.
     pub ms: f64,
+    /// Time that workers rendered for it, all jobs together, milliseconds.
+    pub render_ms: f64,
+    /// Number of jobs it was made of.
+    pub jobs: u32,
+    /// Whether the camera was below the ground.
+    pub below_ground: bool,
     /// With `--check`: 99th percentile of the error, pixels.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub error_px_p99: Option<f64>,

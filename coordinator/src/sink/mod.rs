@@ -62,6 +62,9 @@ pub struct Spec {
     pub height: u32,
     /// Frames per second; pictures ignore it.
     pub fps: f64,
+    /// Number that the first picture of a sequence gets: a part of a flight keeps the
+    /// numbers of the whole. Videos ignore it.
+    pub first: FrameIndex,
     /// Number of frames.
     pub frames: u32,
 }

@@ -15,6 +15,7 @@ const MAX_DIGITS: usize = 20;
 pub(super) struct Sequence {
     names: Names,
     output: PathBuf,
+    first: FrameIndex,
     arrivals: Arrivals,
     bytes: u64,
 }
@@ -22,20 +23,21 @@ pub(super) struct Sequence {
 impl Sequence {
     pub fn open(output: &Path, spec: Spec) -> Result<Box<dyn FrameSink>, SinkError> {
         let names = Names::of(output, spec.frames)?;
-        let first = names.path(0);
-        let folder = first.parent().unwrap_or(Path::new("."));
+        let example = names.path(0);
+        let folder = example.parent().unwrap_or(Path::new("."));
         let output = match &names {
             Names::One(path) => path.clone(),
             Names::Numbered { .. } => folder.to_path_buf(),
         };
-        Ok(Box::new(Sequence { names, output, arrivals: Arrivals::new(spec), bytes: 0 }))
+        let first = spec.first;
+        Ok(Box::new(Sequence { names, output, first, arrivals: Arrivals::new(spec), bytes: 0 }))
     }
 }
 
 impl FrameSink for Sequence {
     fn put(&mut self, frame: FrameIndex, picture: &Rgb8) -> Result<(), SinkError> {
         self.arrivals.admit(frame, picture)?;
-        self.bytes += save(&self.names.path(frame), picture)?;
+        self.bytes += save(&self.names.path(self.first.saturating_add(frame)), picture)?;
         Ok(())
     }
 

@@ -6,7 +6,7 @@ use std::fs;
 use std::process::Command;
 
 fn spec(width: u32, height: u32, frames: u32) -> Spec {
-    Spec { width, height, fps: 25.0, frames }
+    Spec { width, height, fps: 25.0, first: 0, frames }
 }
 
 /// A picture that differs from frame to frame: smooth ramps, as terrain under haze has.

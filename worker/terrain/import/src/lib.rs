@@ -25,8 +25,6 @@ mod sample;
 mod surface;
 mod warp;
 
-pub use request::{
-    ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage,
-};
+pub use request::{ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage};
 pub use run::{Sources, import, import_rasters};
 pub use surface::MAX_FILL_POSTS;

@@ -205,7 +205,7 @@ impl Probe<'_> {
                 if change.is_nan() { 0.0 } else { change }
             };
             let slack = (change(1) + change(columns)) * POSITION_SLACK;
-        errors.max_m = errors.max_m.max(error + slack);
+            errors.max_m = errors.max_m.max(error + slack);
             errors.sum_of_squares += error * error;
             errors.count += 1;
         }
@@ -231,7 +231,8 @@ fn half_samples(samples: &[f32], [width, height]: [usize; 2]) -> Vec<f32> {
 /// West, south, east, north of the positions that are not NaN.
 fn bounds_of(positions: &[[f64; 2]]) -> [f64; 4] {
     let nothing = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
-    positions.iter().filter(|p| p[0].is_finite()).fold(nothing, |bounds, &[x, y]| {
-        crate::grid::union(bounds, [x, y, x, y])
-    })
+    positions
+        .iter()
+        .filter(|p| p[0].is_finite())
+        .fold(nothing, |bounds, &[x, y]| crate::grid::union(bounds, [x, y, x, y]))
 }

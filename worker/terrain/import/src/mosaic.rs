@@ -129,8 +129,7 @@ impl Mosaic {
         let Some([column, row]) = place else { return };
         let [width, height] = placed.size().map(|n| n as i64);
         let [c0, r0, c1, r1] = self.extent;
-        self.extent =
-            [c0.min(column), r0.min(row), c1.max(column + width), r1.max(row + height)];
+        self.extent = [c0.min(column), r0.min(row), c1.max(column + width), r1.max(row + height)];
         self.rank = self.rank.max(placed.rank);
         self.members.push(Member { placed, column, row });
         self.members.sort_by_key(|member| std::cmp::Reverse(member.placed.rank));

@@ -14,12 +14,8 @@ use crate::measure::Measurement;
 use crate::mosaic::{Mosaic, Placed};
 use crate::photo::PhotoStack;
 use crate::place::{bounds_in, native_spacing, place, plan_grid};
-use crate::request::{
-    ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage,
-};
-use crate::surface::{
-    Filled, Heights, Inset, MAX_FILL_POSTS, Stack, StackedMosaic, Watched, Way,
-};
+use crate::request::{ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage};
+use crate::surface::{Filled, Heights, Inset, MAX_FILL_POSTS, Stack, StackedMosaic, Watched, Way};
 
 /// Photos belong to one layer if their resolutions differ by no more than this factor.
 const SAME_RESOLUTION: f64 = 1.5;
@@ -107,7 +103,9 @@ struct Plan {
 impl Plan {
     fn new(sources: Sources, settings: &ImportSettings) -> Result<Plan, ImportError> {
         if sources.elevation.is_empty() {
-            return Err(ImportError::Request("an import needs at least one elevation raster".into()));
+            return Err(ImportError::Request(
+                "an import needs at least one elevation raster".into(),
+            ));
         }
         if settings.fill_voids.is_some_and(|reach| !(1..=MAX_FILL_POSTS).contains(&reach)) {
             return Err(ImportError::Request(format!(
@@ -186,14 +184,20 @@ impl Plan {
                 };
                 let b = stacked.bounds;
                 let partly = kind == "photo"
-                    && (b[0] > base_bounds[0] || b[1] > base_bounds[1]
-                        || b[2] < base_bounds[2] || b[3] < base_bounds[3]);
+                    && (b[0] > base_bounds[0]
+                        || b[1] > base_bounds[1]
+                        || b[2] < base_bounds[2]
+                        || b[3] < base_bounds[3]);
                 let partly = if partly { "; covers part of the terrain" } else { "" };
                 for placed in stacked.mosaic.rasters() {
                     let info = placed.raster.info();
                     let line = format!(
                         "{}: {kind}, {}, {} x {}, {}, {done}{partly}",
-                        file_name(placed), info.format, info.width, info.height, placed.crs
+                        file_name(placed),
+                        info.format,
+                        info.width,
+                        info.height,
+                        placed.crs
                     );
                     lines.push((order, placed.rank, line));
                 }

@@ -53,8 +53,7 @@ impl Way {
             return Ok(Way::Untouched { offset, sign });
         }
         let transformer = Transformer::new(crs, &mosaic.crs)?;
-        let warp =
-            Warp::new(grid.affine(), transformer, mosaic.frame, mosaic.longitude_centre());
+        let warp = Warp::new(grid.affine(), transformer, mosaic.frame, mosaic.longitude_centre());
         Ok(Way::Resampled(Box::new(warp)))
     }
 
@@ -195,8 +194,22 @@ pub const MAX_FILL_POSTS: u32 = 256;
 
 /// Sixteen directions in whole posts; rings are walked in multiples of them.
 const DIRECTIONS: [[i32; 2]; 16] = [
-    [1, 0], [2, 1], [1, 1], [1, 2], [0, 1], [-1, 2], [-1, 1], [-2, 1],
-    [-1, 0], [-2, -1], [-1, -1], [-1, -2], [0, -1], [1, -2], [1, -1], [2, -1],
+    [1, 0],
+    [2, 1],
+    [1, 1],
+    [1, 2],
+    [0, 1],
+    [-1, 2],
+    [-1, 1],
+    [-2, 1],
+    [-1, 0],
+    [-2, -1],
+    [-1, -1],
+    [-1, -2],
+    [0, -1],
+    [1, -2],
+    [1, -1],
+    [2, -1],
 ];
 
 impl Heights for Filled {
@@ -261,9 +274,8 @@ impl Heights for Inset<'_> {
     fn heights(&self, window: PostWindow) -> Result<Vec<f32>, ImportError> {
         let grid = self.own.grid;
         let mut own = self.own.heights(window)?;
-        let place = |n: usize| {
-            [window.i + (n % window.width) as i64, window.j + (n / window.width) as i64]
-        };
+        let place =
+            |n: usize| [window.i + (n % window.width) as i64, window.j + (n / window.width) as i64];
         let edge = |[i, j]: [i64; 2]| {
             let last = grid.posts.map(|n| n as i64 - 1);
             i <= 0 || j <= 0 || i >= last[0] || j >= last[1]
@@ -331,12 +343,7 @@ pub(crate) struct Watched<'a> {
 
 impl<'a> Watched<'a> {
     pub(crate) fn new(heights: &'a dyn Heights, unfilled: Option<&'a dyn Heights>) -> Self {
-        Watched {
-            heights,
-            unfilled,
-            any_valid: AtomicBool::new(false),
-            filled: AtomicU64::new(0),
-        }
+        Watched { heights, unfilled, any_valid: AtomicBool::new(false), filled: AtomicU64::new(0) }
     }
 
     /// Number of posts of a tile's window that were void before; those that two tiles
@@ -352,7 +359,8 @@ impl<'a> Watched<'a> {
             (start..end).contains(&post)
         };
         let count = before.iter().zip(heights).enumerate().filter(|(n, (before, now))| {
-            let (i, j) = (window.i + (n % window.width) as i64, window.j + (n / window.width) as i64);
+            let (i, j) =
+                (window.i + (n % window.width) as i64, window.j + (n / window.width) as i64);
             let filled = before.is_nan() && !now.is_nan();
             filled && owned(i, window.i, 0) && owned(j, window.j, 1)
         });

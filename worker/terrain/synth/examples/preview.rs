@@ -79,9 +79,7 @@ fn all_colors(synth: &Synth) -> Vec<[u8; 4]> {
     let band = 64;
     colors.par_chunks_mut(side * band).enumerate().for_each(|(k, pixels)| {
         let rows = pixels.len() / side;
-        synth
-            .colors(0, (k * band) as i64, side, rows, pixels)
-            .expect("the window fits its buffer");
+        synth.colors(0, (k * band) as i64, side, rows, pixels).expect("the window fits its buffer");
     });
     colors
 }
@@ -138,7 +136,14 @@ impl Scene {
 
     /// What a camera sees: each column of pixels marches away from the eye and paints
     /// what rises above all before it.
-    fn view(&self, eye: [f32; 3], heading: f32, pitch: f32, width: usize, height: usize) -> Vec<u8> {
+    fn view(
+        &self,
+        eye: [f32; 3],
+        heading: f32,
+        pitch: f32,
+        width: usize,
+        height: usize,
+    ) -> Vec<u8> {
         let focal = 0.85 * width as f32;
         let horizon = height as f32 / 2.0 + focal * pitch.to_radians().tan();
         let (sin, cos) = heading.to_radians().sin_cos();
@@ -170,7 +175,8 @@ impl Scene {
                 }
                 for (row, pixel) in pixels[..top].iter_mut().enumerate() {
                     let t = row as f32 / height as f32;
-                    *pixel = [110.0 + 90.0 * t, 150.0 + 60.0 * t, 205.0 + 25.0 * t].map(|c| c as u8);
+                    *pixel =
+                        [110.0 + 90.0 * t, 150.0 + 60.0 * t, 205.0 + 25.0 * t].map(|c| c as u8);
                 }
                 pixels
             })

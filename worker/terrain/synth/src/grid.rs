@@ -79,10 +79,7 @@ impl Grid {
         let (wx, dx) = spline_weights((x - floor_x) as f32);
         let (wy, dy) = spline_weights((y - floor_y) as f32);
         let (ix, iy) = (floor_x as i64 - 1, floor_y as i64 - 1);
-        let inside = ix >= 0
-            && iy >= 0
-            && ix + 3 < self.side as i64
-            && iy + 3 < self.side as i64;
+        let inside = ix >= 0 && iy >= 0 && ix + 3 < self.side as i64 && iy + 3 < self.side as i64;
         let mut sample = Sample { value: 0.0, slope_x: 0.0, slope_y: 0.0 };
         for j in 0..4 {
             let row = if inside {

@@ -173,7 +173,13 @@ impl Synth {
         into: &mut [[u8; 4]],
     ) -> Result<(), SynthError> {
         fits(i0, j0, width, height, into.len())?;
-        photo::paint(&self.surface, i64::from(self.spec.photo_scale), (i0, j0), (width, height), into);
+        photo::paint(
+            &self.surface,
+            i64::from(self.spec.photo_scale),
+            (i0, j0),
+            (width, height),
+            into,
+        );
         Ok(())
     }
 

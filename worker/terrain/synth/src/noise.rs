@@ -117,11 +117,7 @@ impl Noise {
         let (mut sum, mut slope, mut total) = (0.0, 0.0, 1e-6);
         for dy in -1i64..=1 {
             for dx in -1i64..=1 {
-                let h = hash(
-                    (floor_x as i64 + dx) as u32,
-                    (floor_y as i64 + dy) as u32,
-                    self.seed,
-                );
+                let h = hash((floor_x as i64 + dx) as u32, (floor_y as i64 + dy) as u32, self.seed);
                 let px = dx as f32 + (h & 0xFFF) as f32 * (1.0 / 4096.0);
                 let py = dy as f32 + ((h >> 12) & 0xFFF) as f32 * (1.0 / 4096.0);
                 let (vx, vy) = (fx - px, fy - py);

@@ -302,7 +302,10 @@ impl<'a> Palette<'a> {
     /// Snow above a line, lower in the shade and in gullies, none on cliffs.
     fn snow(&self, color: &mut Color, site: &Site, cast: &Cast) {
         let sunny = (site.slope_y * 1.1).clamp(-0.8, 0.8);
-        let line = SNOW_LINE_M + 110.0 * cast.wide + 90.0 * cast.middle + 190.0 * sunny
+        let line = SNOW_LINE_M
+            + 110.0 * cast.wide
+            + 90.0 * cast.middle
+            + 190.0 * sunny
             + 900.0 * site.bulge.clamp(-0.18, 0.18);
         let above = smoothstep(-70.0, 110.0, cast.rise - line + 70.0 * cast.fine);
         let hold = mix(0.80, 1.25, smoothstep(0.0, 500.0, cast.rise - line));

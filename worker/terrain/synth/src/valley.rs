@@ -25,7 +25,8 @@ pub(crate) fn deposit(heights: &Grid, flow: &Flow, cell_m: f32, relief: f32) -> 
         let cell = cell as usize;
         let receiver = flow.receiver[cell] as usize;
         let area_km2 = flow.area[cell] * cell_km2;
-        let thickness = relief * (11.0 * area_km2.sqrt()).min(95.0) * smoothstep(0.8, 6.0, area_km2);
+        let thickness =
+            relief * (11.0 * area_km2.sqrt()).min(95.0) * smoothstep(0.8, 6.0, area_km2);
         let slope = (0.05 / (0.15 + area_km2).sqrt()).clamp(0.004, 0.11);
         let graded = values[receiver] + slope * flow.distance[cell] * cell_m;
         values[cell] = (values[cell] + thickness).max(graded);
@@ -255,9 +256,9 @@ pub(crate) fn reach_of_lakes(level: &Grid, heights: &Grid) -> Grid {
             if here > f32::NEG_INFINITY {
                 return here;
             }
-            let around = NEIGHBOURS.iter().map(|&(dx, dy, _)| {
-                level.at(x as i64 + dx as i64, y as i64 + dy as i64)
-            });
+            let around = NEIGHBOURS
+                .iter()
+                .map(|&(dx, dy, _)| level.at(x as i64 + dx as i64, y as i64 + dy as i64));
             let best = around.fold(f32::NEG_INFINITY, f32::max);
             if heights.at(x as i64, y as i64) >= best { best } else { f32::NEG_INFINITY }
         })
