@@ -125,17 +125,13 @@ impl Grid {
 
     /// The grid as a frame: columns to the east, rows to the north.
     pub(crate) fn affine(&self) -> Affine {
-        Affine {
-            origin: self.origin,
-            column: [self.spacing[0], 0.0],
-            row: [0.0, self.spacing[1]],
-        }
+        Affine { origin: self.origin, column: [self.spacing[0], 0.0], row: [0.0, self.spacing[1]] }
     }
 
     /// West, south, east, north of the outermost posts.
     pub(crate) fn bounds(&self) -> [f64; 4] {
-        let far =
-            [0, 1].map(|axis| self.origin[axis] + (self.posts[axis] - 1) as f64 * self.spacing[axis]);
+        let far = [0, 1]
+            .map(|axis| self.origin[axis] + (self.posts[axis] - 1) as f64 * self.spacing[axis]);
         [self.origin[0], self.origin[1], far[0], far[1]]
     }
 
@@ -198,7 +194,8 @@ mod tests {
 
     #[test]
     fn friendly_spacings_are_round_and_never_coarser() {
-        let cases = [(24.7, 24.0), (30.9, 30.0), (30.0, 30.0), (1.0, 1.0), (0.99, 0.9), (74.1, 60.0)];
+        let cases =
+            [(24.7, 24.0), (30.9, 30.0), (30.0, 30.0), (1.0, 1.0), (0.99, 0.9), (74.1, 60.0)];
         for (native, friendly) in cases {
             assert_eq!(friendly_spacing(native), friendly);
         }

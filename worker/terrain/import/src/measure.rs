@@ -6,6 +6,7 @@
 //! good to [`POSITION_SLACK`] of a post; what that can make up on the slope concerned is
 //! added, so that whoever samples the store finds no larger error.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use rayon::prelude::*;
@@ -49,7 +50,7 @@ impl Errors {
 pub(crate) struct Measurement<'a> {
     pub(crate) crs: &'a Crs,
     /// Coarsest first.
-    pub(crate) layers: Vec<&'a dyn Heights>,
+    pub(crate) layers: &'a [Arc<dyn Heights>],
     /// Topmost last.
     pub(crate) mosaics: Vec<&'a StackedMosaic>,
 }
@@ -190,7 +191,7 @@ impl Probe<'_> {
         expected: &[f32],
         columns: usize,
     ) -> Result<Errors, ImportError> {
-        let layers = &self.measurement.layers;
+        let layers = self.measurement.layers;
         let found = surface_at(layers, positions)?;
         let mut errors = Errors::default();
         for (n, (&found, &here)) in found.iter().zip(expected).enumerate() {
@@ -205,7 +206,7 @@ impl Probe<'_> {
                 if change.is_nan() { 0.0 } else { change }
             };
             let slack = (change(1) + change(columns)) * POSITION_SLACK;
-        errors.max_m = errors.max_m.max(error + slack);
+            errors.max_m = errors.max_m.max(error + slack);
             errors.sum_of_squares += error * error;
             errors.count += 1;
         }
@@ -231,7 +232,8 @@ fn half_samples(samples: &[f32], [width, height]: [usize; 2]) -> Vec<f32> {
 /// West, south, east, north of the positions that are not NaN.
 fn bounds_of(positions: &[[f64; 2]]) -> [f64; 4] {
     let nothing = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
-    positions.iter().filter(|p| p[0].is_finite()).fold(nothing, |bounds, &[x, y]| {
-        crate::grid::union(bounds, [x, y, x, y])
-    })
+    positions
+        .iter()
+        .filter(|p| p[0].is_finite())
+        .fold(nothing, |bounds, &[x, y]| crate::grid::union(bounds, [x, y, x, y]))
 }

@@ -132,7 +132,8 @@ pub(crate) fn plan_grid(
     let Some((least, finest)) = finest.filter(|(least, _)| least.is_finite() && *least > 0.0)
     else {
         return Err(ImportError::Request(
-            "the inputs have no spacing in the store's reference system; choose another --crs".into(),
+            "the inputs have no spacing in the store's reference system; choose another --crs"
+                .into(),
         ));
     };
     let mut bounds = mosaics.iter().map(|(_, bounds)| *bounds).reduce(union).unwrap_or([0.0; 4]);

@@ -125,7 +125,8 @@ mod tests {
     fn at(positions: &[[f64; 2]]) -> Vec<f32> {
         let read = |w: LatticeWindow| {
             let place = |n: usize| [w.column + (n % w.width) as i64, w.row + (n / w.width) as i64];
-            let height = |[c, r]: [i64; 2]| if c == 2 && r == 1 { f32::NAN } else { (c + 10 * r) as f32 };
+            let height =
+                |[c, r]: [i64; 2]| if c == 2 && r == 1 { f32::NAN } else { (c + 10 * r) as f32 };
             Ok((0..w.len()).map(|n| height(place(n))).collect())
         };
         bilinear(positions, EXTENT, &read).unwrap()
@@ -138,7 +139,8 @@ mod tests {
 
     #[test]
     fn a_void_sample_spoils_exactly_where_it_has_weight() {
-        let found = at(&[[1.5, 0.5], [1.0, 0.5], [1.5, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0 + 1e-8, 1.0]]);
+        let found =
+            at(&[[1.5, 0.5], [1.0, 0.5], [1.5, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0 + 1e-8, 1.0]]);
         let void: Vec<bool> = found.iter().map(|height| height.is_nan()).collect();
         assert_eq!(void, [true, false, false, false, true, false]);
     }

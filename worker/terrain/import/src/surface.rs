@@ -5,6 +5,7 @@
 //! Every source gives the same height for a post whichever window asks, so that tiles
 //! agree on the posts they share.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use terrafarm_geo::{Crs, Transformer};
@@ -53,8 +54,7 @@ impl Way {
             return Ok(Way::Untouched { offset, sign });
         }
         let transformer = Transformer::new(crs, &mosaic.crs)?;
-        let warp =
-            Warp::new(grid.affine(), transformer, mosaic.frame, mosaic.longitude_centre());
+        let warp = Warp::new(grid.affine(), transformer, mosaic.frame, mosaic.longitude_centre());
         Ok(Way::Resampled(Box::new(warp)))
     }
 
@@ -186,7 +186,7 @@ pub(crate) fn window_bounds(grid: &Grid, window: PostWindow) -> [f64; 4] {
 /// first valid posts found are averaged with weights 1/distance². Nothing is carried on
 /// from filled posts, so the result does not depend on the order of the work.
 pub(crate) struct Filled {
-    pub(crate) below: Box<dyn Heights>,
+    pub(crate) below: Arc<dyn Heights>,
     pub(crate) reach: usize,
 }
 
@@ -195,8 +195,22 @@ pub const MAX_FILL_POSTS: u32 = 256;
 
 /// Sixteen directions in whole posts; rings are walked in multiples of them.
 const DIRECTIONS: [[i32; 2]; 16] = [
-    [1, 0], [2, 1], [1, 1], [1, 2], [0, 1], [-1, 2], [-1, 1], [-2, 1],
-    [-1, 0], [-2, -1], [-1, -1], [-1, -2], [0, -1], [1, -2], [1, -1], [2, -1],
+    [1, 0],
+    [2, 1],
+    [1, 1],
+    [1, 2],
+    [0, 1],
+    [-1, 2],
+    [-1, 1],
+    [-2, 1],
+    [-1, 0],
+    [-2, -1],
+    [-1, -1],
+    [-1, -2],
+    [0, -1],
+    [1, -2],
+    [1, -1],
+    [2, -1],
 ];
 
 impl Heights for Filled {
@@ -247,13 +261,13 @@ impl Filled {
 
 /// A fine raster in its rectangle; where it is void, and on the outermost ring of posts,
 /// the surface of the layers below, so that the two join.
-pub(crate) struct Inset<'a> {
-    pub(crate) own: Stack,
+pub(crate) struct Inset {
+    pub(crate) own: Arc<Stack>,
     /// Coarsest first.
-    pub(crate) below: Vec<&'a dyn Heights>,
+    pub(crate) below: Vec<Arc<dyn Heights>>,
 }
 
-impl Heights for Inset<'_> {
+impl Heights for Inset {
     fn grid(&self) -> &Grid {
         &self.own.grid
     }
@@ -261,9 +275,8 @@ impl Heights for Inset<'_> {
     fn heights(&self, window: PostWindow) -> Result<Vec<f32>, ImportError> {
         let grid = self.own.grid;
         let mut own = self.own.heights(window)?;
-        let place = |n: usize| {
-            [window.i + (n % window.width) as i64, window.j + (n / window.width) as i64]
-        };
+        let place =
+            |n: usize| [window.i + (n % window.width) as i64, window.j + (n / window.width) as i64];
         let edge = |[i, j]: [i64; 2]| {
             let last = grid.posts.map(|n| n as i64 - 1);
             i <= 0 || j <= 0 || i >= last[0] || j >= last[1]
@@ -294,7 +307,7 @@ impl Heights for Inset<'_> {
 /// # Errors
 /// If an input is damaged.
 pub(crate) fn surface_at(
-    layers: &[&dyn Heights],
+    layers: &[Arc<dyn Heights>],
     positions: &[[f64; 2]],
 ) -> Result<Vec<f32>, ImportError> {
     let mut found = vec![f32::NAN; positions.len()];
@@ -331,12 +344,7 @@ pub(crate) struct Watched<'a> {
 
 impl<'a> Watched<'a> {
     pub(crate) fn new(heights: &'a dyn Heights, unfilled: Option<&'a dyn Heights>) -> Self {
-        Watched {
-            heights,
-            unfilled,
-            any_valid: AtomicBool::new(false),
-            filled: AtomicU64::new(0),
-        }
+        Watched { heights, unfilled, any_valid: AtomicBool::new(false), filled: AtomicU64::new(0) }
     }
 
     /// Number of posts of a tile's window that were void before; those that two tiles
@@ -352,7 +360,8 @@ impl<'a> Watched<'a> {
             (start..end).contains(&post)
         };
         let count = before.iter().zip(heights).enumerate().filter(|(n, (before, now))| {
-            let (i, j) = (window.i + (n % window.width) as i64, window.j + (n / window.width) as i64);
+            let (i, j) =
+                (window.i + (n % window.width) as i64, window.j + (n / window.width) as i64);
             let filled = before.is_nan() && !now.is_nan();
             filled && owned(i, window.i, 0) && owned(j, window.j, 1)
         });

@@ -71,7 +71,8 @@ impl Warp {
         if columns.is_empty() || rows.is_empty() {
             return;
         }
-        let index = |i: i64, j: i64| (j - window.j) as usize * window.width + (i - window.i) as usize;
+        let index =
+            |i: i64, j: i64| (j - window.j) as usize * window.width + (i - window.i) as usize;
         if size == 1 {
             let mut post = [[i as f64, j as f64]];
             self.exact(&mut post);
@@ -138,10 +139,14 @@ mod tests {
 
     #[test]
     fn approximate_positions_stay_within_a_thousandth_of_a_sample() {
-        for (latitude, longitude, spacing, seconds) in
-            [(37.0, -113.0, 24.0, 1.0), (60.0, 5.0, 90.0, 3.0), (-77.0, 166.0, 2.0, 0.1),
-             (88.0, 20.0, 100.0, 3.0), (10.0, 179.9, 900.0, 30.0), (89.9995, 0.0, 10.0, 3.0)]
-        {
+        for (latitude, longitude, spacing, seconds) in [
+            (37.0, -113.0, 24.0, 1.0),
+            (60.0, 5.0, 90.0, 3.0),
+            (-77.0, 166.0, 2.0, 0.1),
+            (88.0, 20.0, 100.0, 3.0),
+            (10.0, 179.9, 900.0, 30.0),
+            (89.9995, 0.0, 10.0, 3.0),
+        ] {
             let warp = warp(latitude, longitude, spacing, seconds);
             let window = PostWindow { i: -37, j: -5, width: 150, height: 140 };
             let points = warp.window(window);
