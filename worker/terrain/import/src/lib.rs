@@ -6,7 +6,7 @@
 //! that this makes is measured and reported. A post is the centre of a sample.
 //!
 //! Read in this order: [`request`] is what is asked; `place` puts rasters on the map and
-//! plans grids; `mosaic` reads rasters on one lattice as one; `warp` finds samples for
+//! `plan` decides systems, grids and layers; `mosaic` reads rasters on one lattice as one; `warp` finds samples for
 //! posts; `sample` interpolates; `surface` and `photo` give the posts of a layer on
 //! demand; `measure` compares; `run` does all of it in order.
 //!
@@ -19,6 +19,7 @@ mod measure;
 mod mosaic;
 mod photo;
 mod place;
+mod plan;
 pub mod request;
 mod run;
 mod sample;

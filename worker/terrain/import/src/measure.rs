@@ -6,6 +6,7 @@
 //! good to [`POSITION_SLACK`] of a post; what that can make up on the slope concerned is
 //! added, so that whoever samples the store finds no larger error.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use rayon::prelude::*;
@@ -49,7 +50,7 @@ impl Errors {
 pub(crate) struct Measurement<'a> {
     pub(crate) crs: &'a Crs,
     /// Coarsest first.
-    pub(crate) layers: Vec<&'a dyn Heights>,
+    pub(crate) layers: &'a [Arc<dyn Heights>],
     /// Topmost last.
     pub(crate) mosaics: Vec<&'a StackedMosaic>,
 }
@@ -190,7 +191,7 @@ impl Probe<'_> {
         expected: &[f32],
         columns: usize,
     ) -> Result<Errors, ImportError> {
-        let layers = &self.measurement.layers;
+        let layers = self.measurement.layers;
         let found = surface_at(layers, positions)?;
         let mut errors = Errors::default();
         for (n, (&found, &here)) in found.iter().zip(expected).enumerate() {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use terrafarm_geo::Crs;
-use terrafarm_raster::info::{Content, Raster, RasterError, Window};
+use terrafarm_raster::info::{Raster, RasterError, Window};
 
 use crate::grid::Affine;
 
@@ -145,9 +145,9 @@ impl Mosaic {
         [0, 1].map(|axis| (self.extent[axis] + self.extent[axis + 2] - 1) as f64 / 2.0)
     }
 
-    /// Whether the samples are heights.
-    pub(crate) fn is_heights(&self) -> bool {
-        self.members.iter().all(|m| m.placed.raster.info().content == Content::Heights)
+    /// The rasters, topmost first.
+    pub(crate) fn rasters(&self) -> impl Iterator<Item = &Placed> {
+        self.members.iter().map(|member| &member.placed)
     }
 
     /// Whether heights that cannot be terrain were met and taken as void.

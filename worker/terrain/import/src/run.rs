@@ -4,23 +4,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use terrafarm_geo::{Crs, gaussian_radius_m};
-use terrafarm_raster::info::{Content, Raster, Vertical};
+use terrafarm_geo::gaussian_radius_m;
+use terrafarm_raster::OpenOptions;
+use terrafarm_raster::info::{Content, Raster};
 use terrafarm_terrain::build::{LayerSpec, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{ImportReport, LayerKind};
 
-use crate::grid::{Grid, overlap, union};
+use crate::grid::Grid;
 use crate::measure::Measurement;
-use crate::mosaic::{Mosaic, Placed};
 use crate::photo::PhotoStack;
-use crate::place::{bounds_in, native_spacing, place, plan_grid};
+use crate::plan::{Plan, PlannedLayer, centre_of, file_name};
 use crate::request::{ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage};
-use crate::surface::{Filled, Heights, Inset, MAX_FILL_POSTS, Stack, StackedMosaic, Watched, Way};
-
-/// Photos belong to one layer if their resolutions differ by no more than this factor.
-const SAME_RESOLUTION: f64 = 1.5;
-/// Largest departure from true scale that is accepted without being asked for.
-const TRUE_SCALE: f64 = 0.02;
+use crate::surface::{Filled, Heights, Inset, Stack, StackedMosaic, Watched};
 /// Memory for decoded blocks of all inputs together, bytes.
 const CACHE_BYTES: usize = 256 << 20;
 /// The least memory for decoded blocks of one input, bytes.
@@ -49,7 +44,7 @@ pub fn import(
 ) -> Result<ImportSummary, ImportError> {
     let count = request.elevation.len() + request.insets.len() + request.photos.len();
     let share = (CACHE_BYTES / count.max(1)).max(LEAST_CACHE_BYTES);
-    let open_all = |paths: &[PathBuf], options: &terrafarm_raster::OpenOptions, content| {
+    let open_all = |paths: &[PathBuf], options: &OpenOptions, content| {
         let mut options = options.clone();
         options.content.get_or_insert(content);
         options.block_cache_bytes = options.block_cache_bytes.min(share);
@@ -79,160 +74,106 @@ pub fn import_rasters(
     cancel: &AtomicBool,
 ) -> Result<ImportSummary, ImportError> {
     let plan = Plan::new(sources, settings)?;
-    plan.build(output, progress, cancel)
+    build(plan, output, progress, cancel)
 }
 
-/// A layer of heights or photos before it is built.
-struct PlannedLayer {
-    grid: Grid,
-    mosaics: Vec<StackedMosaic>,
+fn build(
+    plan: Plan,
+    output: &Path,
+    progress: &dyn Fn(Progress),
+    cancel: &AtomicBool,
+) -> Result<ImportSummary, ImportError> {
+    let Plan { crs, base, insets, photos, fill, datum, inputs, mut warnings } = plan;
+    let radius = match crs.is_local() {
+        true => None,
+        false => Some(gaussian_radius_m(crs.to_lonlat(centre_of(base.grid.bounds()))?[1])),
+    };
+    let base = Arc::new(Stack { grid: base.grid, mosaics: base.mosaics });
+    let surface: Arc<dyn Heights> = match fill {
+        Some(reach) => Arc::new(Filled { below: base.clone(), reach: reach as usize }),
+        None => base.clone(),
+    };
+
+    let mut builder = StoreBuilder::create(output, crs.text(), datum, radius)?;
+    let unfilled = fill.map(|_| &*base as &dyn Heights);
+    let watched = Watched::new(&*surface, unfilled);
+    let spec = height_spec(&base.grid, quantum(&base.mosaics));
+    builder.add_layer(spec, &watched, &stage(progress, Stage::Heights), cancel)?;
+    if !watched.any_valid.load(Ordering::Relaxed) {
+        return Err(ImportError::AllVoid { inputs: names(&base.mosaics) });
+    }
+
+    let mut layers = vec![surface.clone()];
+    let mut stacks = vec![base.clone()];
+    for (number, PlannedLayer { grid, mosaics }) in insets.into_iter().enumerate() {
+        let own = Arc::new(Stack { grid, mosaics });
+        let inset = Inset { own: own.clone(), below: layers.clone() };
+        let stage = stage(progress, Stage::Inset(number + 1));
+        builder.add_layer(height_spec(&grid, None), &Watched::new(&inset, None), &stage, cancel)?;
+        layers.push(Arc::new(inset));
+        stacks.push(own);
+    }
+    for (number, PlannedLayer { grid, mosaics }) in photos.into_iter().enumerate() {
+        let Grid { origin, spacing, posts } = grid;
+        let photo = PhotoStack { grid, mosaics, any_covered: AtomicBool::new(false) };
+        let spec = LayerSpec { kind: LayerKind::Photo, origin, spacing, posts, quantum_m: None };
+        let stage = stage(progress, Stage::Photo(number + 1));
+        builder.add_layer(spec, &photo, &stage, cancel)?;
+        if !photo.any_covered.load(Ordering::Relaxed) {
+            warnings.push(format!("nothing of {} covers the terrain", names(&photo.mosaics)));
+        }
+    }
+
+    let mosaics: Vec<&StackedMosaic> = stacks.iter().flat_map(|stack| &stack.mosaics).collect();
+    warnings.extend(mosaics.iter().filter(|stacked| stacked.mosaic.met_wild_heights()).map(
+        |stacked| {
+            let names = names(std::slice::from_ref(stacked));
+            format!(
+                "{names}: heights beyond 100 km were taken as voids; is a no-data value missing?"
+            )
+        },
+    ));
+    let measurement = Measurement { crs: &crs, layers: &layers, mosaics };
+    let errors = if measurement.is_needed() {
+        measurement.run(&stage(progress, Stage::Measuring), cancel)?
+    } else {
+        Default::default()
+    };
+    let report = ImportReport {
+        inputs,
+        warnings,
+        max_resampling_error_m: errors.max_m,
+        rms_resampling_error_m: errors.rms_m(),
+        void_posts: 0,
+        made_by: concat!("terrafarm ", env!("CARGO_PKG_VERSION")).into(),
+    };
+    let store = builder.finish(report.clone())?;
+    let filled_posts = watched.filled.load(Ordering::Relaxed);
+    Ok(ImportSummary { store, report, crs: crs.text().to_owned(), filled_posts })
 }
 
-/// Everything that is decided before the first tile.
-struct Plan {
-    crs: Crs,
-    base: PlannedLayer,
-    insets: Vec<PlannedLayer>,
-    photos: Vec<PlannedLayer>,
-    fill: Option<u32>,
-    datum: HeightDatum,
-    inputs: Vec<String>,
-    warnings: Vec<String>,
+fn height_spec(grid: &Grid, quantum_m: Option<f32>) -> LayerSpec {
+    let Grid { origin, spacing, posts } = *grid;
+    LayerSpec { kind: LayerKind::Height, origin, spacing, posts, quantum_m }
 }
 
-impl Plan {
-    fn new(sources: Sources, settings: &ImportSettings) -> Result<Plan, ImportError> {
-        if sources.elevation.is_empty() {
-            return Err(ImportError::Request(
-                "an import needs at least one elevation raster".into(),
-            ));
-        }
-        if settings.fill_voids.is_some_and(|reach| !(1..=MAX_FILL_POSTS).contains(&reach)) {
-            return Err(ImportError::Request(format!(
-                "voids can be filled over 1 to {MAX_FILL_POSTS} posts"
-            )));
-        }
-        let elevation = place_all(sources.elevation, Content::Heights, settings)?;
-        let insets = place_all(sources.insets, Content::Heights, settings)?;
-        let photos = place_all(sources.photos, Content::Photo, settings)?;
-        let all: Vec<Placed> = elevation.iter().chain(&insets).chain(&photos).cloned().collect();
-        let mut warnings = Vec::new();
-        let (datum, datum_warning) = height_datum(elevation.iter().chain(&insets));
-        warnings.extend(datum_warning);
-        let base = Mosaic::group(elevation);
-        refuse_thin(&base)?;
-        let crs = choose_crs(&base, settings, &mut warnings)?;
-        for placed in &all {
-            let info = placed.raster.info();
-            let name = file_name(placed);
-            let systems = placed.crs.warnings().iter().filter(|_| !placed.crs.is_same_grid(&crs));
-            warnings.extend(info.warnings.iter().chain(systems).map(|w| format!("{name}: {w}")));
-        }
-        warnings.dedup();
-        let base = plan_layer(base, &crs, None)?;
-        warn_of_scale(&crs, base.grid, &mut warnings)?;
-        let mut inset_layers = Vec::new();
-        for mosaics in touching(insets, &crs)? {
-            refuse_thin(&mosaics)?;
-            let mut layer = plan_layer(mosaics, &crs, None)?;
-            layer.grid = layer.grid.grown(1);
-            refuse_apart(&layer, &base, &crs)?;
-            inset_layers.push(layer);
-        }
-        inset_layers.sort_by(|a, b| {
-            let area = |layer: &PlannedLayer| layer.grid.spacing[0] * layer.grid.spacing[1];
-            area(b).total_cmp(&area(a))
-        });
-        let mut photo_layers = Vec::new();
-        for mosaics in by_resolution(photos, &crs)? {
-            for mosaic in &mosaics {
-                refuse_photo_apart(mosaic, &base, &crs)?;
-            }
-            photo_layers.push(plan_layer(mosaics, &crs, Some(base.grid.bounds()))?);
-        }
-        let mut plan = Plan {
-            crs,
-            base,
-            insets: inset_layers,
-            photos: photo_layers,
-            fill: settings.fill_voids,
-            datum,
-            inputs: Vec::new(),
-            warnings,
-        };
-        plan.describe();
-        Ok(plan)
-    }
+/// The step that all heights of untouched mosaics share.
+fn quantum(mosaics: &[StackedMosaic]) -> Option<f32> {
+    let untouched = mosaics.iter().all(|stacked| stacked.way.is_untouched());
+    let mut steps = mosaics
+        .iter()
+        .flat_map(|stacked| stacked.mosaic.rasters())
+        .map(|placed| placed.raster.info().quantum_m);
+    let first = steps.next().flatten().filter(|_| untouched)?;
+    steps.all(|step| step == Some(first)).then_some(first as f32)
+}
 
-    /// Fills in the report's line for every input.
-    fn describe(&mut self) {
-        let base_bounds = self.base.grid.bounds();
-        let kinds = [("elevation", 0), ("inset", 1), ("photo", 2)];
-        let layers = std::iter::once((kinds[0], &self.base))
-            .chain(self.insets.iter().map(|layer| (kinds[1], layer)))
-            .chain(self.photos.iter().map(|layer| (kinds[2], layer)));
-        let mut lines = Vec::new();
-        for ((kind, order), layer) in layers {
-            let [dx, dy] = layer.grid.spacing.map(|step| format!("{step:.6}"));
-            let trim = |text: &str| text.trim_end_matches('0').trim_end_matches('.').to_owned();
-            let spacing = format!("{} x {} m", trim(&dx), trim(&dy));
-            for stacked in &layer.mosaics {
-                let done = if stacked.way.is_untouched() {
-                    format!("taken untouched, {spacing}")
-                } else {
-                    format!("resampled to {spacing}")
-                };
-                let b = stacked.bounds;
-                let partly = kind == "photo"
-                    && (b[0] > base_bounds[0]
-                        || b[1] > base_bounds[1]
-                        || b[2] < base_bounds[2]
-                        || b[3] < base_bounds[3]);
-                let partly = if partly { "; covers part of the terrain" } else { "" };
-                for placed in stacked.mosaic.rasters() {
-                    let info = placed.raster.info();
-                    let line = format!(
-                        "{}: {kind}, {}, {} x {}, {}, {done}{partly}",
-                        file_name(placed),
-                        info.format,
-                        info.width,
-                        info.height,
-                        placed.crs
-                    );
-                    lines.push((order, placed.rank, line));
-                }
-            }
-        }
-        lines.sort();
-        self.inputs = lines.into_iter().map(|(_, _, line)| line).collect();
-    }
+fn names(mosaics: &[impl std::borrow::Borrow<StackedMosaic>]) -> String {
+    let rasters = mosaics.iter().flat_map(|stacked| stacked.borrow().mosaic.rasters());
+    rasters.map(file_name).collect::<Vec<_>>().join(", ")
+}
 
-    fn build(
-        self,
-        output: &Path,
-        progress: &dyn Fn(Progress),
-        cancel: &AtomicBool,
-    ) -> Result<ImportSummary, ImportError> {
-        let centre = centre_of(self.base.grid.bounds());
-        let radius = match self.crs.is_local() {
-            true => None,
-            false => Some(gaussian_radius_m(self.crs.to_lonlat(centre)?[1])),
-        };
-        let mut builder = StoreBuilder::create(output, self.crs.text(), self.datum, radius)?;
-        let mut filled_posts = 0;
-        let base = stack(self.base);
-        let quantum = quantum(&base.mosaics);
-        let names = base.mosaics.iter().flat_map(|stacked| stacked.mosaic.rasters());
-        let names: Vec<String> = names.map(file_name).collect();
-        let filled;
-        let base: &dyn Heights = match self.fill {
-            None => &base,
-            Some(reach) => {
-                filled = Filled { below: &base, reach: reach as usize };
-                &filled
-            }
-        };
-        let _ = (quantum, &mut builder, names, base, &mut filled_posts, progress, cancel);
-        unimplemented!()
-    }
+/// Progress of one stage.
+fn stage(progress: &dyn Fn(Progress), stage: Stage) -> impl Fn(u64, u64) {
+    move |done, total| progress(Progress { stage, done, total })
 }

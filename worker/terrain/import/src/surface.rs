@@ -5,6 +5,7 @@
 //! Every source gives the same height for a post whichever window asks, so that tiles
 //! agree on the posts they share.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use terrafarm_geo::{Crs, Transformer};
@@ -185,7 +186,7 @@ pub(crate) fn window_bounds(grid: &Grid, window: PostWindow) -> [f64; 4] {
 /// first valid posts found are averaged with weights 1/distance². Nothing is carried on
 /// from filled posts, so the result does not depend on the order of the work.
 pub(crate) struct Filled {
-    pub(crate) below: Box<dyn Heights>,
+    pub(crate) below: Arc<dyn Heights>,
     pub(crate) reach: usize,
 }
 
@@ -260,13 +261,13 @@ impl Filled {
 
 /// A fine raster in its rectangle; where it is void, and on the outermost ring of posts,
 /// the surface of the layers below, so that the two join.
-pub(crate) struct Inset<'a> {
-    pub(crate) own: Stack,
+pub(crate) struct Inset {
+    pub(crate) own: Arc<Stack>,
     /// Coarsest first.
-    pub(crate) below: Vec<&'a dyn Heights>,
+    pub(crate) below: Vec<Arc<dyn Heights>>,
 }
 
-impl Heights for Inset<'_> {
+impl Heights for Inset {
     fn grid(&self) -> &Grid {
         &self.own.grid
     }
@@ -306,7 +307,7 @@ impl Heights for Inset<'_> {
 /// # Errors
 /// If an input is damaged.
 pub(crate) fn surface_at(
-    layers: &[&dyn Heights],
+    layers: &[Arc<dyn Heights>],
     positions: &[[f64; 2]],
 ) -> Result<Vec<f32>, ImportError> {
     let mut found = vec![f32::NAN; positions.len()];
