@@ -9,12 +9,16 @@ use std::cell::RefCell;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use terrafarm_common::camera::MAX_SIDE_PX;
+use terrafarm_common::image::Rgb8;
 use terrafarm_coordinator::sink::poster;
 use terrafarm_import::{ImportRequest, ImportSettings, ImportSummary, Stage};
 use terrafarm_raster::info::Content;
-use terrafarm_raster::options::{self, OpenOptions};
+use terrafarm_raster::{OpenOptions, options};
 use terrafarm_synth::SynthSpec;
+use terrafarm_terrain::hillshade;
 use terrafarm_terrain::info::{StoreInfo, summary};
+use terrafarm_terrain::layout::{LayerKind, PostWindow};
 use terrafarm_terrain::store::StoreReader;
 
 /// Carries out one of the terrain commands.
@@ -25,7 +29,7 @@ pub fn run(command: Terrain) -> anyhow::Result<Outcome> {
         Terrain::Sample { store, points } => sample::run(&store, &points)?,
         Terrain::Synth(args) => synth(&args)?,
         Terrain::Hillshade { store, output, azimuth, altitude } => {
-            hillshade(&store, &output, azimuth, altitude)?;
+            write_hillshade(&store, &output, azimuth, altitude)?;
         }
     }
     Ok(Outcome::Done)
@@ -116,7 +120,47 @@ fn print_import(args: &args::Import, done: &ImportSummary) -> anyhow::Result<()>
 fn info(store: &Path, json: bool) -> anyhow::Result<()> {
     let reader = StoreReader::open(store)?;
     let info: StoreInfo = summary(&reader);
-    if json { print_json(&info) } else { Ok(println!("{info}")) }
+    if json { print_json(&info) } else { Ok(print_info(&info)) }
+}
+
+fn print_info(info: &StoreInfo) {
+    const MIB: f64 = 1048576.0;
+    let [[x0, y0], [x1, y1]] = [info.min, info.max];
+    println!("crs           {}", info.crs);
+    println!("extent        {x0:.2} {y0:.2} to {x1:.2} {y1:.2} ({:.1} x {:.1} km)", (x1 - x0) / 1e3, (y1 - y0) / 1e3);
+    println!("height datum  {:?}", info.height_datum);
+    match info.height_range_m {
+        Some([low, high]) => println!("heights       {low} to {high} m"),
+        None => println!("heights       none: every post is void"),
+    }
+    println!("voids         {} of {} posts", info.void_posts, info.height_posts);
+    for (number, layer) in info.layers.iter().enumerate() {
+        let tiles: u64 = layer.levels.iter().map(|level| level.filled_tiles).sum();
+        println!(
+            "layer {number}       {:?}: {} x {} posts, {} x {} m, {} levels, {tiles} tiles, bytes per post {:.2} on disk, {:.2} in memory",
+            layer.kind,
+            layer.posts[0],
+            layer.posts[1],
+            layer.spacing_m[0],
+            layer.spacing_m[1],
+            layer.levels.len(),
+            layer.disk_bytes_per_post,
+            layer.memory_bytes_per_post,
+        );
+    }
+    let report = &info.report;
+    println!(
+        "resampling    largest error {:.3} m, rms {:.3} m",
+        report.max_resampling_error_m, report.rms_resampling_error_m
+    );
+    for input in &report.inputs {
+        println!("input         {input}");
+    }
+    for warning in &report.warnings {
+        println!("warning       {warning}");
+    }
+    println!("made by       {}", report.made_by);
+    println!("file          {:.1} MiB, index {}", info.file_bytes as f64 / MIB, info.hash);
 }
 
 fn synth(args: &args::Synth) -> anyhow::Result<()> {
@@ -153,10 +197,22 @@ pub fn write_synth(path: &Path, spec: SynthSpec, force: bool) -> anyhow::Result<
     Ok(())
 }
 
-fn hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> anyhow::Result<()> {
+fn write_hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> anyhow::Result<()> {
     let reader = StoreReader::open(store)?;
-    let shade = terrafarm_terrain::hillshade::overview(&reader, azimuth, altitude)?;
-    let picture = shade.into_rgb8();
+    let (number, layer) = reader
+        .index()
+        .layers_of(LayerKind::Height)
+        .next()
+        .context("the store has no heights")?;
+    let [width, height] = layer.posts;
+    if layer.posts.iter().any(|&side| side > u64::from(MAX_SIDE_PX)) {
+        bail!("{width} x {height} posts make too large a picture; at most {MAX_SIDE_PX} a side");
+    }
+    let window = PostWindow { i0: 0, j0: 0, width: width as usize, height: height as usize };
+    let grey = hillshade::hillshade(&reader, number as u16, window, azimuth, altitude)?;
+    let pixels = grey.iter().flat_map(|&grey| [grey; 3]).collect();
+    let picture = Rgb8::from_pixels(width as u32, height as u32, pixels)
+        .context("the hillshade has the wrong number of posts")?;
     poster::save(output, &picture)?;
     println!("{}: {} x {}", output.display(), picture.width(), picture.height());
     Ok(())
