@@ -9,6 +9,7 @@ mod args;
 mod commands;
 mod farm;
 mod input;
+mod place;
 mod progress;
 mod shot;
 

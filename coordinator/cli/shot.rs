@@ -2,11 +2,14 @@
 
 use crate::Outcome;
 use crate::farm::{Crew, LocalFarm};
+use crate::input::flight;
+use crate::input::scene::Scene;
+use crate::place::StorePlace;
 use crate::progress;
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, bail};
 use indicatif::ProgressBar;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use terrafarm_common::camera::Camera;
@@ -19,7 +22,7 @@ use terrafarm_coordinator::client::{self, ClientError, FrameFacts, Submission, U
 use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
 use terrafarm_film::OrderedFrames;
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
-use terrafarm_terrain::store::StoreReader;
+use terrafarm_terrain::store::{StoreReader, hash_of};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -63,6 +66,68 @@ pub struct Plan {
     pub poster: Option<(FrameIndex, PathBuf)>,
     /// Who renders.
     pub farm: Farm,
+}
+
+/// What is chosen for a flight over a scene.
+pub struct Choice<'a> {
+    /// The scene file.
+    pub scene: &'a Path,
+    /// The flight file.
+    pub flight: &'a Path,
+    /// Size of the picture, pixels.
+    pub size: (u32, u32),
+    /// Frames per second.
+    pub fps: f64,
+    /// Frames to render, the end not included; all if `None`.
+    pub frames: Option<(FrameIndex, FrameIndex)>,
+}
+
+impl Plan {
+    /// Opens the terrain of a scene and turns a flight into cameras: local workers, PNG
+    /// pictures in the current folder, to be changed by the caller.
+    pub fn read(scene: &Scene, choice: &Choice) -> anyhow::Result<Plan> {
+        let store = StoreReader::open(&scene.terrain)
+            .with_context(|| format!("cannot use the terrain of {}", choice.scene.display()))?;
+        let place = StorePlace::new(&store)?;
+        let file = flight::read(choice.flight, &place, scene.hfov_deg)?;
+        for warning in &file.warnings {
+            eprintln!("terrafarm: warning: {warning}");
+        }
+        let times = file.flight.frame_times(choice.fps)?;
+        let total = times.len() as u32;
+        let (first, end) = choice.frames.unwrap_or((0, total));
+        if first >= total {
+            bail!("--frames {first}..{end}: the flight has {total} frames at {} a second", choice.fps);
+        }
+        let cameras = times
+            .skip(first as usize)
+            .take((end.min(total) - first) as usize)
+            .map(|t| file.flight.pose_at(t).camera(choice.size))
+            .collect();
+        let shading = scene
+            .shading(store.index().earth_radius_m, place.middle_convergence_deg())
+            .map_err(|why| anyhow!("{}: {why}", choice.scene.display()))?;
+        let scene_bytes = std::fs::read(choice.scene)
+            .with_context(|| format!("cannot read {}", choice.scene.display()))?;
+        Ok(Plan {
+            name: choice.scene.display().to_string(),
+            scene: choice.scene.to_owned(),
+            scene_sha256: hash_of(&scene_bytes),
+            flight: choice.flight.to_owned(),
+            shading,
+            quality: scene.quality,
+            split: Split::Columns,
+            first_frame: first,
+            cameras,
+            fps: choice.fps,
+            frames_in_flight: FRAMES_IN_FLIGHT,
+            output: PathBuf::from("."),
+            encoder: Encoder::BuiltIn,
+            poster: None,
+            farm: Farm::Local(Crew::fill(None, None)),
+            store: Arc::new(store),
+        })
+    }
 }
 
 /// Who renders.

@@ -2,18 +2,13 @@
 
 use super::render;
 use crate::farm::Crew;
-use crate::input::{self, Scene};
-use crate::shot::{self, FRAMES_IN_FLIGHT, Farm, Plan};
+use crate::input::scene::Scene;
+use crate::shot::{self, Choice, Farm, Plan};
 use crate::{Outcome, args};
 use anyhow::Context;
 use std::fs;
 use std::path::Path;
-use std::sync::Arc;
-use terrafarm_common::quality::Quality;
-use terrafarm_common::region::Split;
-use terrafarm_coordinator::sink::Encoder;
 use terrafarm_synth::SynthSpec;
-use terrafarm_terrain::store::StoreReader;
 
 /// Terrain of the demo: the seed was chosen for its lake and its ridge.
 const TERRAIN: SynthSpec = SynthSpec { posts: 2049, spacing_m: 18.0, seed: 1, photo_scale: 1 };
@@ -39,27 +34,14 @@ pub fn run(args: &args::Demo) -> anyhow::Result<Outcome> {
     let flight_path = write(folder, "demo.csv", FLIGHT)?;
 
     let scene = Scene::read(&scene_path)?;
-    let store = Arc::new(StoreReader::open(&terrain)?);
-    let place = input::StorePlace::new(store.clone())?;
-    let flight = input::read_flight(&flight_path, &place)?;
-    let times = flight.flight.frame_times(FPS).context("cannot cut the flight into frames")?;
-    let cameras = times.map(|t| flight.flight.pose_at(t).camera(SIZE)).collect();
-    let cores = Crew::fill(Some(args.workers), None);
+    let choice =
+        Choice { scene: &scene_path, flight: &flight_path, size: SIZE, fps: FPS, frames: None };
     let plan = Plan {
         name: "demo".into(),
-        scene: scene_path,
-        shading: scene.shading(store.index())?,
-        store,
-        quality: Quality::default(),
-        split: Split::Columns,
-        first_frame: 0,
-        cameras,
-        fps: FPS,
-        frames_in_flight: FRAMES_IN_FLIGHT,
         output: folder.join("demo.mp4"),
-        encoder: Encoder::BuiltIn,
         poster: Some((POSTER, folder.join("poster.png"))),
-        farm: Farm::Local(cores),
+        farm: Farm::Local(Crew::fill(Some(args.workers), None)),
+        ..Plan::read(&scene, &choice)?
     };
     let report = super::runtime()?.block_on(shot::carry_out(plan))?;
     render::print(&report, args.json)?;

@@ -1,19 +1,13 @@
 //! `terrafarm render`: a scene and a flight become pictures.
 
 use crate::farm::Crew;
-use crate::input::{self, Scene};
-use crate::shot::{self, FRAMES_IN_FLIGHT, Farm, Plan, Report};
+use crate::input::scene::Scene;
+use crate::shot::{self, Choice, FRAMES_IN_FLIGHT, Farm, Plan, Report};
 use crate::{Outcome, args};
-use anyhow::{Context, bail};
+use anyhow::Context;
 use std::path::Path;
-use std::sync::Arc;
+use terrafarm_common::quality::{Method, Quality};
 use terrafarm_coordinator::sink::Encoder;
-use terrafarm_terrain::store::StoreReader;
-
-/// Size of the picture unless the scene or the user says otherwise.
-const SIZE: (u32, u32) = (1280, 720);
-/// Frames per second unless the scene or the user says otherwise.
-const FPS: f64 = 30.0;
 
 /// Renders and prints where the result is.
 pub fn run(args: &args::Render) -> anyhow::Result<Outcome> {
@@ -25,67 +19,55 @@ pub fn run(args: &args::Render) -> anyhow::Result<Outcome> {
 
 fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     let scene = read_scene(&args.scene)?;
-    let store = StoreReader::open(&scene.terrain)
-        .with_context(|| format!("cannot use the terrain of {}", args.scene.display()))?;
-    let store = Arc::new(store);
-    let place = input::StorePlace::new(store.clone())?;
-    let flight = input::read_flight(&args.flight, &place)?;
-    for warning in &flight.warnings {
-        eprintln!("terrafarm: warning: {warning}");
-    }
-    let fps = args.fps.or(scene.fps).unwrap_or(FPS);
-    let size = args.size.or(scene.size).unwrap_or(SIZE);
-    let times = flight.flight.frame_times(fps).context("cannot cut the flight into frames")?;
-    let total = times.len() as u32;
-    let (first, end) = args.frames.unwrap_or((0, total));
-    if first >= total {
-        bail!("--frames {first}..{end}: the flight has {total} frames at {fps} frames/s");
-    }
-    let end = end.min(total);
-    let cameras: Vec<_> = times
-        .skip(first as usize)
-        .take((end - first) as usize)
-        .map(|t| flight.flight.pose_at(t).camera(size))
-        .collect();
-    let mut quality = scene.quality();
+    let mut quality = scene.quality;
     if let Some(method) = args.method {
-        quality.method = method;
-        quality.samples_per_side = input::default_samples(method);
+        quality = Quality { method, samples_per_side: default_samples(method) };
     }
     if let Some(samples) = args.samples {
         quality.samples_per_side = samples;
     }
-    input::check_quality(quality)?;
+    let choice = Choice {
+        scene: &args.scene,
+        flight: &args.flight,
+        size: args.size.unwrap_or(scene.size),
+        fps: args.fps.unwrap_or(scene.fps),
+        frames: args.frames,
+    };
     Ok(Plan {
         name: args.output.display().to_string(),
-        scene: args.scene.clone(),
-        shading: scene.shading(store.index())?,
         quality,
         split: args.split,
-        first_frame: first,
-        cameras,
-        fps,
         frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
         output: args.output.clone(),
         encoder: match args.encoder {
             args::Encoder::Builtin => Encoder::BuiltIn,
             args::Encoder::Ffmpeg => Encoder::Ffmpeg,
         },
-        poster: None,
         farm: match &args.coordinator {
             Some(address) => Farm::Remote(address.clone()),
             None => Farm::Local(Crew::fill(args.workers, args.threads)),
         },
-        store,
+        ..Plan::read(&scene, &choice)?
     })
+}
+
+/// Samples along a side of a pixel unless the user says otherwise.
+fn default_samples(method: Method) -> u32 {
+    match method {
+        Method::Exact => 1,
+        Method::Reference => 8,
+    }
 }
 
 /// A scene file, or a bare store with the light that a scene has by default.
 fn read_scene(path: &Path) -> anyhow::Result<Scene> {
     if path.extension().is_some_and(|extension| extension == "terrain") {
-        return Ok(Scene::of_terrain(path));
+        // What a scene file of this one line would say.
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let line = format!("terrain = {}\n[sun]\n", toml::Value::String(name.into_owned()));
+        return Ok(Scene::parse(path, &line)?);
     }
-    Scene::read(path)
+    Ok(Scene::read(path)?)
 }
 
 /// Says what was made, for people or for scripts.
