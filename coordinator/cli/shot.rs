@@ -107,12 +107,17 @@ impl Plan {
         let shading = scene
             .shading(store.index().earth_radius_m, place.middle_convergence_deg())
             .map_err(|why| anyhow!("{}: {why}", choice.scene.display()))?;
-        let scene_bytes = std::fs::read(choice.scene)
-            .with_context(|| format!("cannot read {}", choice.scene.display()))?;
+        // A store that stands for a scene has an identity already, and may be large.
+        let scene_sha256 = if choice.scene == scene.terrain {
+            store.index_blob().0
+        } else {
+            let bytes = std::fs::read(choice.scene);
+            hash_of(&bytes.with_context(|| format!("cannot read {}", choice.scene.display()))?)
+        };
         Ok(Plan {
             name: choice.scene.display().to_string(),
             scene: choice.scene.to_owned(),
-            scene_sha256: hash_of(&scene_bytes),
+            scene_sha256,
             flight: choice.flight.to_owned(),
             shading,
             quality: scene.quality,
