@@ -1,2 +1,5 @@
 #![allow(missing_docs)]
+#[allow(dead_code)]
+mod input;
+
 fn main() {}
