@@ -255,7 +255,7 @@ fn parse_tile(text: &str) -> anyhow::Result<(u8, u32, u32)> {
         _ => None,
     };
     match parsed {
-        Some(((z, x), y)) if z <= 24 && x < 1 << z && y < 1 << z => Ok((z, x, y)),
+        Some(((z, x), y)) if z <= 24 && x < 1u32 << z && y < 1u32 << z => Ok((z, x, y)),
         _ => bail!("--tile {text}: write Z/X/Y as in a map's address, such as 10/906/404"),
     }
 }

@@ -245,14 +245,14 @@ mod tests {
 
     #[test]
     fn boxes_nest_without_a_gap() {
-        fn walk(bytes: &[u8], depth: usize, seen: &mut Vec<String>) {
+        fn walk(bytes: &[u8], seen: &mut Vec<String>) {
             let mut at = 0;
             while at < bytes.len() {
                 let length = u32::from_be_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
                 let kind = String::from_utf8_lossy(&bytes[at + 4..at + 8]).into_owned();
                 let inside = &bytes[at + 8..at + length as usize];
                 if ["moov", "trak", "mdia", "minf", "stbl", "dinf"].contains(&kind.as_str()) {
-                    walk(inside, depth + 1, seen);
+                    walk(inside, seen);
                 }
                 seen.push(kind);
                 at += length as usize;
@@ -260,7 +260,7 @@ mod tests {
             assert_eq!(at, bytes.len());
         }
         let mut seen = Vec::new();
-        walk(&track(40).index(&[5; 40]), 0, &mut seen);
+        walk(&track(40).index(&[5; 40]), &mut seen);
         for kind in ["mvhd", "tkhd", "mdhd", "hdlr", "stsd", "stts", "stss", "stsz", "co64"] {
             assert!(seen.iter().any(|s| s == kind), "{kind}");
         }
