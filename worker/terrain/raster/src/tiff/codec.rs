@@ -180,6 +180,23 @@ mod tests {
         assert_eq!(out, expected);
     }
 
+    #[test]
+    fn the_floating_point_predictor_has_its_most_significant_bytes_first_in_both_orders() {
+        let samples = [1000.25f32, 2.0, 3.5, -4.0, 5.0, 6.125];
+        // Two bands of three pixels: bytes of equal weight together, then differences.
+        let mut stored: Vec<u8> =
+            (0..4).flat_map(|weight| samples.map(|sample| sample.to_be_bytes()[weight])).collect();
+        for k in (2..stored.len()).rev() {
+            stored[k] = stored[k].wrapping_sub(stored[k - 2]);
+        }
+        for order in [Order::Little, Order::Big] {
+            let mut bytes = stored.clone();
+            let row = bytes.len();
+            to_native(&mut bytes, 3, order, 4, 2, row);
+            assert_eq!(bytes, samples.map(f32::to_ne_bytes).concat());
+        }
+    }
+
     proptest! {
         #[test]
         fn random_bytes_give_the_asked_length_or_an_error(
