@@ -90,7 +90,7 @@ impl Grid {
             let slack = 1e-6;
             let first = ((bounds[axis] - phase[axis]) / spacing[axis] + slack).floor();
             let last = ((bounds[axis + 2] - phase[axis]) / spacing[axis] - slack).ceil();
-            let count = (last - first).max(0.0) + 1.0;
+            let count = if last < first { 1.0 } else { last - first + 1.0 };
             if !count.is_finite() || count > MAX_POSTS as f64 {
                 return Err(format!(
                     "the terrain would have {count:.0} posts of {} m along a side; at most \

@@ -200,12 +200,13 @@ impl Probe<'_> {
                 continue;
             }
             // Change of the input per sample along both axes, where it can be seen.
-            let change = |step: usize| {
-                let next = if n >= step { expected[n - step] } else { here };
+            let change = |step: usize, first: bool| {
+                let next = if first { here } else { expected[n - step] };
                 let change = 2.0 * (f64::from(here) - f64::from(next)).abs();
                 if change.is_nan() { 0.0 } else { change }
             };
-            let slack = (change(1) + change(columns)) * POSITION_SLACK;
+            let along = change(1, n % columns == 0) + change(columns, n < columns);
+            let slack = along * POSITION_SLACK;
             errors.max_m = errors.max_m.max(error + slack);
             errors.sum_of_squares += error * error;
             errors.count += 1;

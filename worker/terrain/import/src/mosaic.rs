@@ -145,6 +145,15 @@ impl Mosaic {
         [0, 1].map(|axis| (self.extent[axis] + self.extent[axis + 2] - 1) as f64 / 2.0)
     }
 
+    /// Column and row of the middle of the first raster given.
+    pub(crate) fn first_middle(&self) -> [f64; 2] {
+        let first = self.members.iter().min_by_key(|member| member.placed.rank);
+        first.map_or([0.0; 2], |member| {
+            let [width, height] = member.placed.size().map(|n| (n as f64 - 1.0) / 2.0);
+            [member.column as f64 + width, member.row as f64 + height]
+        })
+    }
+
     /// The rasters, topmost first.
     pub(crate) fn rasters(&self) -> impl Iterator<Item = &Placed> {
         self.members.iter().map(|member| &member.placed)

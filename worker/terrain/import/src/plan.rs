@@ -78,13 +78,12 @@ impl Plan {
             warnings.extend(info.warnings.iter().chain(systems).map(|w| format!("{name}: {w}")));
         }
         warnings.dedup();
-        let base = plan_layer(base, &crs, None)?;
+        let base = plan_layer(base, &crs, None, 0)?;
         warn_of_scale(&crs, base.grid, &mut warnings)?;
         let mut inset_layers = Vec::new();
         for mosaics in touching(insets, &crs)? {
             refuse_thin(&mosaics)?;
-            let mut layer = plan_layer(mosaics, &crs, None)?;
-            layer.grid = layer.grid.grown(1);
+            let layer = plan_layer(mosaics, &crs, None, 1)?;
             refuse_apart(&layer, &base, &crs)?;
             inset_layers.push(layer);
         }
@@ -97,7 +96,7 @@ impl Plan {
             for mosaic in &mosaics {
                 refuse_photo_apart(mosaic, &base, &crs)?;
             }
-            photo_layers.push(plan_layer(mosaics, &crs, Some(base.grid.bounds()))?);
+            photo_layers.push(plan_layer(mosaics, &crs, Some(base.grid.bounds()), 0)?);
         }
         let mut plan = Plan {
             crs,
@@ -231,7 +230,7 @@ fn choose_crs(
             return Ok(mosaic.crs.clone());
         }
         if mosaic.crs.is_metric_projected() {
-            let scale = mosaic.crs.scale(mosaic.frame.at(mosaic.middle()))?;
+            let scale = mosaic.crs.scale(mosaic.frame.at(mosaic.first_middle()))?;
             if (scale - 1.0).abs() <= TRUE_SCALE {
                 return Ok(mosaic.crs.clone());
             }
@@ -303,18 +302,20 @@ fn warn_of_scale(crs: &Crs, grid: Grid, warnings: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
-/// Puts mosaics over one another on a common grid.
+/// Puts mosaics over one another on a common grid, cut to `clip` and grown by a ring of
+/// so many posts.
 fn plan_layer(
     mosaics: Vec<Mosaic>,
     crs: &Crs,
     clip: Option<[f64; 4]>,
+    ring: u64,
 ) -> Result<PlannedLayer, ImportError> {
     let mut bounded = Vec::with_capacity(mosaics.len());
     for mosaic in mosaics {
         let bounds = bounds_in(&mosaic, crs, &path_of(&mosaic))?;
         bounded.push((mosaic, bounds));
     }
-    let grid = plan_grid(&bounded, crs, clip)?;
+    let grid = plan_grid(&bounded, crs, clip)?.grown(ring);
     stack_on(grid, bounded, crs)
 }
 
