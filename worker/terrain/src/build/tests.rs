@@ -1,7 +1,8 @@
 #![allow(clippy::unwrap_used)]
+use super::levels::BATCH;
 use super::*;
 use crate::fixture::{Ground, height_layer, hills};
-use crate::layout::TileKey;
+use crate::layout::{TILE_CELLS, TileKey};
 use crate::resident::Tile;
 use crate::store::StoreReader;
 use crate::tile::HeightTile;
@@ -275,6 +276,8 @@ fn sizes_beyond_the_limits_are_refused_before_anything_is_read() {
     assert!(refused(height_layer([MAX_POSTS, MAX_POSTS])).contains("tiles"));
     assert!(refused(height_layer([u64::MAX, u64::MAX])).contains("posts"));
     refused(LayerSpec { spacing: [0.0, 1.0], ..height_layer([5, 5]) });
+    refused(LayerSpec { spacing: [1e308, 1.0], ..height_layer([5, 5]) });
+    refused(LayerSpec { quantum_m: Some(0.0), ..height_layer([5, 5]) });
     refused(LayerSpec { origin: [f64::NAN, 1.0], ..height_layer([5, 5]) });
     let missing = create("no/such/folder.terrain").err().unwrap().to_string();
     assert!(missing.contains("does the folder exist?"), "{missing}");
