@@ -260,7 +260,8 @@ mod tests {
                     prop_assert_eq!(film.open.get(&frame).map(|open| &open.picture), before.as_ref());
                 }
             }
-            prop_assert!(film.merge(0, Region { x: u32::MAX, y: 1, width: u32::MAX, height: 1 }, &[]).is_err());
+            let absurd = Region { x: u32::MAX, y: 1, width: u32::MAX, height: 1 };
+            prop_assert!(film.merge(0, absurd, &[]).is_err());
         }
     }
 

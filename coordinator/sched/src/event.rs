@@ -206,6 +206,14 @@ pub enum Action {
         /// The shot.
         shot: ShotId,
     },
+    /// A worker gets jobs of that shot again, since the others are gone or do no better.
+    /// For the log.
+    Unblocked {
+        /// The worker.
+        worker: WorkerId,
+        /// The shot.
+        shot: ShotId,
+    },
 }
 
 /// How a connection ended.

@@ -3,6 +3,7 @@
 use crate::config::Config;
 use crate::event::Action;
 use crate::lease::Lease;
+use crate::outcome::HOPELESS_EXPIRIES;
 use crate::scheduler::{Scheduler, Timer};
 use crate::shot::{Job, JobKey, Shot};
 use crate::worker::Worker;
@@ -25,7 +26,7 @@ const LATE_SHARE: f64 = 0.5;
 /// ... and this time, microseconds.
 const LATE_US: u64 = 50_000;
 /// A lease's time doubles with every expiry of its job, at most so often.
-const MAX_DOUBLINGS: u32 = 20;
+const MAX_DOUBLINGS: u32 = 6;
 
 impl Scheduler {
     /// Grants while there are hungry workers and something to grant, then hedges.
@@ -63,7 +64,7 @@ impl Scheduler {
                         && !shot.blocked.contains(failed)
                 });
                 !job.failed_on.contains(&worker)
-                    || job.expiries > 0
+                    || job.expiries >= HOPELESS_EXPIRIES
                     || active <= shot.blocked.len() + others.count()
             });
             let again = again.map(|(&key, _)| key);
@@ -253,7 +254,8 @@ impl Scheduler {
 fn target_us(config: &Config, shot: &mut Shot, worker: &Worker, active_speed: f64) -> f64 {
     let (shortest, longest) = (config.job_min_us as f64, config.job_max_us as f64);
     if !shot.costs.is_measured() {
-        return shortest;
+        // One atom: enough to learn what a pixel costs, whatever it turns out to be.
+        return 0.0;
     }
     let left_us = shot.cost_ahead() / active_speed.max(worker.speed.value());
     let longest = if worker.speed.is_measured { longest } else { longest * UNMEASURED_SHARE };

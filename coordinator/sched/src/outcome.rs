@@ -11,6 +11,9 @@ const MAX_TRIES: usize = 3;
 const MAX_FAULTS: u32 = 3;
 /// A shot ends when so many frames have failed and not one is complete.
 const MAX_LEADING_FAILURES: u32 = 16;
+/// A job that expired so often is given to anyone: those trusted with it do no better than
+/// those that failed.
+pub(crate) const HOPELESS_EXPIRIES: u32 = 2;
 /// The largest time a result may claim, microseconds: a day.
 const MAX_COST_US: u64 = 86_400_000_000;
 
@@ -171,6 +174,15 @@ impl Scheduler {
         }
     }
 
+    /// Gives everyone another chance.
+    pub(crate) fn unblock_all(&mut self, id: ShotId) {
+        let Some(shot) = self.shots.get_mut(&id) else { return };
+        shot.faults.clear();
+        for worker in std::mem::take(&mut shot.blocked) {
+            self.actions.push_back(Action::Unblocked { worker, shot: id });
+        }
+    }
+
     /// A worker has had its first job for too long: all it holds waits for others.
     pub(crate) fn head_expired(&mut self, worker: WorkerId) {
         let now = self.now;
@@ -216,7 +228,11 @@ impl Scheduler {
         } else if let Some(job) = shot.running.remove(&key)
             && end != End::Unwanted
         {
+            let is_hopeless = job.expiries >= HOPELESS_EXPIRIES;
             shot.waiting.insert(key, job);
+            if is_hopeless {
+                self.unblock_all(lease.shot);
+            }
             self.refresh_ready(lease.shot);
             self.unpark();
         }

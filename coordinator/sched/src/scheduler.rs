@@ -225,14 +225,16 @@ impl Scheduler {
         self.active -= 1;
         self.active_threads -= u64::from(known.threads);
         self.active_speed -= known.speed.value();
-        for shot in self.shots.values_mut() {
+        let mut alone = Vec::new();
+        for (&id, shot) in &mut self.shots {
             shot.faults.remove(&worker);
             shot.blocked.remove(&worker);
             if shot.blocked.len() >= self.active {
-                // A block holds only while somebody else is there to do better.
-                shot.blocked.clear();
+                alone.push(id);
             }
         }
+        // A block holds only while somebody else is there to do better.
+        alone.into_iter().for_each(|id| self.unblock_all(id));
         self.unpark();
     }
 

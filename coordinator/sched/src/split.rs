@@ -147,7 +147,7 @@ impl CostMap {
         let last_allowed =
             start.saturating_add(u32::try_from(strips.max(1)).unwrap_or(u32::MAX)).min(end);
         let rest = self.run(start, end);
-        let pieces = (rest / target).ceil().max(1.0);
+        let pieces = (rest / target.max(f64::MIN_POSITIVE)).ceil().max(1.0);
         let goal = rest / pieces;
         let mut sum = self.atom(start);
         let mut cut = start + 1;

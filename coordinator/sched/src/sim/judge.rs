@@ -159,6 +159,11 @@ impl Judge {
                     shot.blocked.insert(*worker);
                 }
             }
+            Action::Unblocked { worker, shot } => {
+                if let Some(shot) = self.shots.get_mut(shot) {
+                    shot.blocked.remove(worker);
+                }
+            }
             Action::Probe { .. } => {}
         }
     }
@@ -301,16 +306,9 @@ impl Judge {
         self.unblock(worker);
     }
 
-    /// A worker is no longer there to be blocked; where all that are left are blocked,
-    /// none is.
+    /// A worker is no longer there to be blocked.
     fn unblock(&mut self, worker: WorkerId) {
-        let active = self.workers.values().filter(|&&drains| !drains).count();
-        for shot in self.shots.values_mut() {
-            shot.blocked.remove(&worker);
-            if shot.blocked.len() >= active {
-                shot.blocked.clear();
-            }
-        }
+        self.shots.values_mut().for_each(|shot| _ = shot.blocked.remove(&worker));
     }
 
     fn expect(

@@ -100,7 +100,7 @@ impl SimConfig {
             seed,
             frames: (60.0 * speed / frame_work_s).ceil() as u32,
             frame_work_s,
-            frames_in_flight: base.frames_in_flight.max(workers / 25),
+            frames_in_flight: base.frames_in_flight.max(workers / 10),
             ..base
         }
     }

@@ -204,7 +204,7 @@ impl<'a> World<'a> {
                     self.client(shot, |client| client.failed.insert(frame));
                 }
                 Action::ShotComplete { .. } | Action::ShotFailed { .. } => self.shots_left -= 1,
-                Action::Refuse { .. } | Action::Blocked { .. } => {}
+                Action::Refuse { .. } | Action::Blocked { .. } | Action::Unblocked { .. } => {}
             }
         }
         self.judge.settled();
@@ -441,10 +441,10 @@ impl<'a> World<'a> {
             jobs: account.granted,
             frames: self.frames,
             failed_frames: self.failed_frames,
-            redo_share: 1.0 - useful_us / rendered_us.max(1.0),
+            redo_share: (1.0 - useful_us / rendered_us.max(1.0)).max(0.0),
             time: TimeShares {
                 useful: share(useful_us),
-                redone: share(rendered_us - useful_us),
+                redone: share((rendered_us - useful_us).max(0.0)),
                 waiting: 1.0 - share(rendered_us),
             },
             account,
