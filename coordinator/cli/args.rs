@@ -276,8 +276,8 @@ pub struct Worker {
     /// Folder for terrain tiles [default: the user's cache folder]
     #[arg(long)]
     pub cache_dir: Option<PathBuf>,
-    /// Size limit of that folder, MiB
-    #[arg(long, default_value_t = 4096, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
+    /// Size limit of that folder, MiB; 0 keeps nothing on disk
+    #[arg(long, default_value_t = 4096, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
     pub cache_limit: u64,
     /// Memory for decoded tiles, MiB
     #[arg(long, default_value_t = 1024, value_parser = clap::value_parser!(u64).range(64..=1_048_576))]

@@ -388,6 +388,9 @@ impl Farm {
                 Action::Blocked { worker, shot } => {
                     tracing::warn!(%worker, %shot, "worker failed too often and gets no more of this shot");
                 }
+                Action::Unblocked { worker, shot } => {
+                    tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
+                }
                 Action::Accept { .. } | Action::Refuse { .. } => {
                     tracing::error!(?action, "a verdict without a result");
                 }
@@ -492,3 +495,6 @@ impl Farm {
         self.out.push_back(Out::Send(peer, message.into()));
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -3,8 +3,9 @@
 use crate::{Outcome, args};
 use anyhow::{Context, bail};
 use std::path::PathBuf;
+use std::time::{SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
-use terrafarm_worker::WorkerConfig;
+use terrafarm_worker::{Reconnect, WorkerConfig};
 use tokio::net::TcpListener;
 
 const MIB: u64 = 1 << 20;
@@ -41,11 +42,13 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
     let config = WorkerConfig {
         coordinator: args.coordinator,
         name: args.name.unwrap_or_else(pc_name),
-        threads: args.threads.unwrap_or(cores),
-        cache_dir: args.cache_dir.unwrap_or_else(default_cache_dir),
+        threads: args.threads.unwrap_or(cores) as usize,
+        cache_dir: (args.cache_limit > 0)
+            .then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
-        memory_limit_bytes: (args.memory_limit * MIB) as usize,
-        reconnect: !args.once,
+        memory_limit_bytes: args.memory_limit * MIB,
+        reconnect: if args.once { Reconnect::Never } else { Reconnect::Forever },
+        seed: process_seed(),
     };
     runtime()?.block_on(async {
         terrafarm_worker::run(config, stop_signal()).await?;
@@ -76,6 +79,12 @@ pub async fn stop_signal() {
         }
     }
     let _ = tokio::signal::ctrl_c().await;
+}
+
+/// Different for every process that is started: the worker's incarnation.
+fn process_seed() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    (since.as_nanos() as u64).rotate_left(24) ^ u64::from(std::process::id())
 }
 
 fn default_cache_dir() -> PathBuf {

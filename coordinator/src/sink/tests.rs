@@ -308,6 +308,9 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
         index: 0,
         sha256: pixels_sha256(&picture).to_hex(),
         ms: 12.5,
+        render_ms: 20.0,
+        jobs: 3,
+        below_ground: false,
         error_px_p99: None,
         mismatch: None,
     };
@@ -325,6 +328,8 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
         size: [2, 2],
         fps: 25.0,
         frames: vec![frame],
+        failed: [(1, "no such tile".to_string())].into(),
+        workers: Vec::new(),
     };
     let path = manifest.save(&folder.path().join("film.mp4")).unwrap();
     let text = fs::read(path).unwrap();
