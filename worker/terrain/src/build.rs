@@ -9,10 +9,10 @@
 use crate::codec::{CodecError, MAX_TILE_BYTES, TILE_AREA};
 use crate::layout::{
     HeightDatum, ImportReport, Layer, LayerKind, Level, MAX_LAYERS, MAX_POSTS, MAX_TILES,
-    STORE_VERSION, StoreIndex, TILE_CELLS, TILE_POSTS, TILE_RING, TileEntry,
+    PostWindow, STORE_VERSION, StoreIndex, TILE_CELLS, TILE_POSTS, TILE_RING, TileEntry,
 };
 use crate::positioned::{read_exact_at, write_all_at};
-use crate::pyramid::{FINE_REACH, FinePosts, Post, Window, post_in_tile};
+use crate::pyramid::{FINE_REACH, FinePosts, Post, post_in_tile};
 use crate::store::{HEADER_BYTES, Header, MAX_INDEX_BYTES, hash_of};
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -428,7 +428,7 @@ impl StoreBuilder {
         let grid = layer.level_posts(level);
         let side = 2 * TILE_CELLS as i64;
         let reach = FINE_REACH as i64;
-        let window = Window::clipped(
+        let window = PostWindow::clipped(
             [i64::from(columns.start) * side - reach, i64::from(row) * side - reach],
             [i64::from(columns.end) * side + reach, (i64::from(row) + 1) * side + reach],
             grid,
@@ -510,7 +510,7 @@ fn read_tile<P: Post>(
     ty: u32,
     posts: [u64; 2],
 ) -> Result<Vec<P>, SourceError> {
-    let window = Window::of_tile(tx, ty, posts);
+    let window = PostWindow::of_tile(tx, ty, posts);
     let mut read = vec![P::VOID; window.area()];
     P::read(source, window, &mut read)?;
     let mut tile = vec![P::VOID; TILE_AREA];
@@ -564,7 +564,7 @@ fn count_voids<P: Post>(tile: &[P], tx: u32, ty: u32, posts: [u64; 2]) -> u64 {
 }
 
 /// Copies what a tile, ring left out, has of a window.
-fn copy_tile<P: Post>([tx, ty]: [u32; 2], tile: &[P], window: Window, posts: &mut [P]) {
+fn copy_tile<P: Post>([tx, ty]: [u32; 2], tile: &[P], window: PostWindow, posts: &mut [P]) {
     let overlap = |t: u32, first: u64, length: usize| {
         let start = u64::from(t) * TILE_CELLS as u64;
         start.max(first)..(start + TILE_CELLS as u64 + 1).min(first + length as u64)

@@ -145,6 +145,19 @@ pub struct TileKey {
     pub ty: u32,
 }
 
+/// A rectangle of posts of a level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PostWindow {
+    /// First column, from the west.
+    pub i0: u64,
+    /// First row, from the south.
+    pub j0: u64,
+    /// Number of columns.
+    pub width: usize,
+    /// Number of rows.
+    pub height: usize,
+}
+
 /// How a store was made: shown by `terrafarm terrain info`, read by nobody else.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 pub struct ImportReport {

@@ -20,27 +20,18 @@
 use crate::build::{LayerSource, SourceError};
 use crate::codec::{self, CodecError};
 use crate::color::{LINEAR_OF_SRGB, srgb_of_linear};
-use crate::layout::{LayerKind, MAX_HEIGHT_M, TILE_CELLS, TILE_POSTS, TILE_RING};
+use crate::layout::{LayerKind, MAX_HEIGHT_M, PostWindow, TILE_CELLS, TILE_POSTS, TILE_RING};
 
 /// Fine posts beyond the ground of a row of coarse tiles that their rings depend on: a
 /// ring post is two fine posts out, its tent three.
 pub(crate) const FINE_REACH: u64 = 3;
 
-/// A rectangle of posts of a level.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Window {
-    pub(crate) i0: u64,
-    pub(crate) j0: u64,
-    pub(crate) width: usize,
-    pub(crate) height: usize,
-}
-
-impl Window {
+impl PostWindow {
     /// The posts from `first` to `last`, both included, that lie in a grid.
-    pub(crate) fn clipped(first: [i64; 2], last: [i64; 2], posts: [u64; 2]) -> Window {
+    pub(crate) fn clipped(first: [i64; 2], last: [i64; 2], posts: [u64; 2]) -> PostWindow {
         let low = |axis: usize| (first[axis].max(0) as u64).min(posts[axis] - 1);
         let high = |axis: usize| (last[axis].max(0) as u64).min(posts[axis] - 1);
-        Window {
+        PostWindow {
             i0: low(0),
             j0: low(1),
             width: (high(0) - low(0) + 1) as usize,
@@ -49,9 +40,9 @@ impl Window {
     }
 
     /// The posts of a tile, ring included, that lie in a grid.
-    pub(crate) fn of_tile(tx: u32, ty: u32, posts: [u64; 2]) -> Window {
+    pub(crate) fn of_tile(tx: u32, ty: u32, posts: [u64; 2]) -> PostWindow {
         let first = [tx, ty].map(|t| i64::from(t) * TILE_CELLS as i64 - TILE_RING as i64);
-        Window::clipped(first, first.map(|post| post + TILE_POSTS as i64 - 1), posts)
+        PostWindow::clipped(first, first.map(|post| post + TILE_POSTS as i64 - 1), posts)
     }
 
     pub(crate) fn area(&self) -> usize {
@@ -69,8 +60,11 @@ pub(crate) trait Post: Copy + Send + Sync + 'static {
     /// What of a source's post is stored.
     fn cleaned(self) -> Self;
 
-    fn read(source: &dyn LayerSource, window: Window, into: &mut [Self])
-    -> Result<(), SourceError>;
+    fn read(
+        source: &dyn LayerSource,
+        window: PostWindow,
+        into: &mut [Self],
+    ) -> Result<(), SourceError>;
 
     fn encode(posts: &[Self], step_m: Option<f64>) -> Vec<u8>;
 
@@ -107,7 +101,7 @@ impl Post for f32 {
         if self.abs() <= MAX_HEIGHT_M { self + 0.0 } else { f32::NAN }
     }
 
-    fn read(source: &dyn LayerSource, w: Window, into: &mut [f32]) -> Result<(), SourceError> {
+    fn read(source: &dyn LayerSource, w: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
         source.heights(w.i0 as i64, w.j0 as i64, w.width, w.height, into)
     }
 
@@ -178,7 +172,11 @@ impl Post for [u8; 4] {
         if self[3] == 0 { [0; 4] } else { self }
     }
 
-    fn read(source: &dyn LayerSource, w: Window, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
+    fn read(
+        source: &dyn LayerSource,
+        w: PostWindow,
+        into: &mut [[u8; 4]],
+    ) -> Result<(), SourceError> {
         source.colors(w.i0 as i64, w.j0 as i64, w.width, w.height, into)
     }
 
@@ -224,7 +222,7 @@ impl Post for [u8; 4] {
 pub(crate) struct FinePosts<P> {
     /// Number of posts of the whole level.
     pub(crate) grid: [u64; 2],
-    pub(crate) window: Window,
+    pub(crate) window: PostWindow,
     pub(crate) posts: Vec<P>,
 }
 
@@ -264,7 +262,7 @@ impl<P: Post> FinePosts<P> {
         posts: [u64; 2],
         step_m: Option<f64>,
     ) -> Vec<P> {
-        let inside = Window::of_tile(tx, ty, posts);
+        let inside = PostWindow::of_tile(tx, ty, posts);
         let mut tile = vec![P::VOID; codec::TILE_AREA];
         for j in inside.j0..inside.j0 + inside.height as u64 {
             for i in inside.i0..inside.i0 + inside.width as u64 {
@@ -338,7 +336,7 @@ mod tests {
 
     /// A level of so many posts from a rule.
     fn level(grid: [u64; 2], rule: impl Fn(u64, u64) -> f32) -> FinePosts<f32> {
-        let window = Window { i0: 0, j0: 0, width: grid[0] as usize, height: grid[1] as usize };
+        let window = PostWindow { i0: 0, j0: 0, width: grid[0] as usize, height: grid[1] as usize };
         let posts = (0..window.area() as u64).map(|at| rule(at % grid[0], at / grid[0])).collect();
         FinePosts { grid, window, posts }
     }

@@ -1,11 +1,14 @@
 //! Decoded tiles that a render call may use, by position in the store.
 //!
 //! A [`Resident`] is a plain table: the ray caster looks tiles up by index, without a
-//! lock or a hash. Workers keep one per store and hand out snapshots of it.
+//! lock or a hash. Workers keep one per store and hand out snapshots of it: a clone shares
+//! the tiles and the record of their use, so that what a render call touches in its
+//! snapshot is young in the original, too.
 
 use crate::layout::{LayerKind, StoreIndex, TileKey};
 use crate::tile::{HeightTile, PhotoTile};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// A decoded tile of either kind.
 #[derive(Clone)]
@@ -60,6 +63,17 @@ pub struct Resident {
     index: Arc<StoreIndex>,
     /// Per layer, per level, row by row from the south-west.
     slots: Vec<Vec<Vec<Slot>>>,
+    /// Sum over the loaded tiles.
+    bytes: usize,
+    uses: Arc<Uses>,
+}
+
+/// When each tile was last used, shared by all snapshots.
+struct Uses {
+    /// The present, in rounds: see [`Resident::next_round`].
+    round: AtomicU32,
+    /// In the order of the slots.
+    last: Vec<Vec<Box<[AtomicU32]>>>,
 }
 
 impl Resident {
@@ -74,7 +88,12 @@ impl Resident {
             levels.collect()
         });
         let slots = slots.collect();
-        Resident { index, slots }
+        let last = index.layers.iter().map(|layer| {
+            let levels = layer.levels.iter();
+            levels.map(|level| level.entries.iter().map(|_| AtomicU32::new(0)).collect()).collect()
+        });
+        let uses = Uses { round: AtomicU32::new(0), last: last.collect() };
+        Resident { index, slots, bytes: 0, uses: Arc::new(uses) }
     }
 
     /// The index of the store.
@@ -82,28 +101,93 @@ impl Resident {
         &self.index
     }
 
-    /// Puts a tile in its place. Returns `false`, and changes nothing, if the key names
-    /// no tile or one of the other kind.
+    /// Puts a tile in its place; it counts as used now. Returns `false`, and changes
+    /// nothing, if the key names no tile or one of the other kind.
     pub fn insert(&mut self, key: TileKey, tile: Tile) -> bool {
         let Some(layer) = self.index.layers.get(usize::from(key.layer)) else { return false };
-        let fits = matches!(
-            (layer.kind, &tile),
-            (LayerKind::Height, Tile::Height(_)) | (LayerKind::Photo, Tile::Photo(_))
-        );
-        match self.slot_mut(key) {
-            Some(slot) if fits => {
-                *slot = Slot::Loaded(tile);
-                true
-            }
-            _ => false,
+        if layer.kind != tile.kind() {
+            return false;
         }
+        let added = tile.memory_bytes();
+        let Some(slot) = self.slot_mut(key) else { return false };
+        let replaced = std::mem::replace(slot, Slot::Loaded(tile)).memory_bytes();
+        self.bytes = self.bytes + added - replaced;
+        self.touch(key);
+        true
     }
 
     /// Forgets a tile; it can be loaded again.
     pub fn remove(&mut self, key: TileKey) {
         if let Some(slot @ Slot::Loaded(_)) = self.slot_mut(key) {
-            *slot = Slot::Absent;
+            let freed = std::mem::replace(slot, Slot::Absent).memory_bytes();
+            self.bytes -= freed;
         }
+    }
+
+    /// Memory of the loaded tiles, bytes. What snapshots still hold after a tile was
+    /// evicted here is not counted.
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Marks a tile as used in this round: one relaxed store, from any thread.
+    #[inline]
+    pub fn touch(&self, key: TileKey) {
+        if let Some(at) = self.position(key) {
+            let round = self.uses.round.load(Ordering::Relaxed);
+            self.uses.last[usize::from(key.layer)][usize::from(key.level)][at]
+                .store(round, Ordering::Relaxed);
+        }
+    }
+
+    /// Begins a new round, typically with each job: tiles touched from now on are younger
+    /// than those touched before.
+    pub fn next_round(&self) {
+        self.uses.round.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Forgets the tiles unused for most rounds until the rest takes at most so many
+    /// bytes; of equal age, those first in the order of keys. Returns what went.
+    pub fn evict_to(&mut self, bytes: usize) -> Vec<TileKey> {
+        if self.bytes <= bytes {
+            return Vec::new();
+        }
+        let round = self.uses.round.load(Ordering::Relaxed);
+        let mut loaded: Vec<(u32, TileKey)> = self
+            .loaded()
+            .map(|key| {
+                let at = self.position(key).expect("a loaded tile has a place");
+                let last = &self.uses.last[usize::from(key.layer)][usize::from(key.level)][at];
+                (round.wrapping_sub(last.load(Ordering::Relaxed)), key)
+            })
+            .collect();
+        loaded.sort_unstable_by(|(age_a, a), (age_b, b)| age_b.cmp(age_a).then(a.cmp(b)));
+        let mut evicted = Vec::new();
+        for (_, key) in loaded {
+            if self.bytes <= bytes {
+                break;
+            }
+            self.remove(key);
+            evicted.push(key);
+        }
+        evicted
+    }
+
+    /// The loaded tiles, in the order of keys within each row.
+    pub fn loaded(&self) -> impl Iterator<Item = TileKey> + '_ {
+        self.slots.iter().enumerate().flat_map(move |(layer, levels)| {
+            levels.iter().enumerate().flat_map(move |(level, slots)| {
+                let columns = self.index.layers[layer].levels[level].tiles[0] as usize;
+                let loaded =
+                    slots.iter().enumerate().filter(|(_, slot)| matches!(slot, Slot::Loaded(_)));
+                loaded.map(move |(at, _)| TileKey {
+                    layer: layer as u16,
+                    level: level as u16,
+                    tx: (at % columns) as u32,
+                    ty: (at / columns) as u32,
+                })
+            })
+        })
     }
 
     /// A tile of a height layer.
@@ -128,32 +212,127 @@ impl Resident {
 
     #[inline]
     fn slot(&self, key: TileKey) -> Option<&Slot> {
-        let tiles = self
-            .index
-            .layers
-            .get(usize::from(key.layer))?
-            .levels
-            .get(usize::from(key.level))?
-            .tiles;
-        if key.tx >= tiles[0] || key.ty >= tiles[1] {
-            return None;
-        }
-        self.slots[usize::from(key.layer)][usize::from(key.level)]
-            .get(key.ty as usize * tiles[0] as usize + key.tx as usize)
+        let at = self.position(key)?;
+        self.slots[usize::from(key.layer)][usize::from(key.level)].get(at)
     }
 
     fn slot_mut(&mut self, key: TileKey) -> Option<&mut Slot> {
-        let tiles = self
-            .index
-            .layers
-            .get(usize::from(key.layer))?
-            .levels
-            .get(usize::from(key.level))?
-            .tiles;
-        if key.tx >= tiles[0] || key.ty >= tiles[1] {
-            return None;
+        let at = self.position(key)?;
+        self.slots[usize::from(key.layer)][usize::from(key.level)].get_mut(at)
+    }
+
+    /// Place of a tile within its level; `None` if there is no such tile.
+    #[inline]
+    fn position(&self, key: TileKey) -> Option<usize> {
+        let layer = self.index.layers.get(usize::from(key.layer))?;
+        let tiles = layer.levels.get(usize::from(key.level))?.tiles;
+        let inside = key.tx < tiles[0] && key.ty < tiles[1];
+        inside.then(|| key.ty as usize * tiles[0] as usize + key.tx as usize)
+    }
+}
+
+impl Slot {
+    fn memory_bytes(&self) -> usize {
+        match self {
+            Slot::Loaded(tile) => tile.memory_bytes(),
+            Slot::Empty | Slot::Absent => 0,
         }
-        self.slots[usize::from(key.layer)][usize::from(key.level)]
-            .get_mut(key.ty as usize * tiles[0] as usize + key.tx as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::fixture::{Ground, height_layer, hills};
+    use crate::store::StoreReader;
+    use crate::tile::HEIGHT_TILE_BYTES;
+
+    /// All tiles of a store of 3 x 2 tiles (the last one void), one of a photo, and none
+    /// of them loaded.
+    fn tiles() -> (Resident, Vec<(TileKey, Tile)>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.terrain");
+        let holed = |i: u64, j: u64| if i >= 512 && j >= 256 { f32::NAN } else { hills(i, j) };
+        Ground::new()
+            .heights(height_layer([760, 500]), holed)
+            .colors(height_layer([9, 9]), |_, _| [1, 2, 3, 255])
+            .build(&path)
+            .unwrap();
+        let store = StoreReader::open(&path).unwrap();
+        let photo = TileKey { layer: 1, level: 0, tx: 0, ty: 0 };
+        let keys = (0..6).map(|at| TileKey { layer: 0, level: 0, tx: at % 3, ty: at / 3 });
+        let tiles = keys
+            .chain([photo])
+            .filter_map(|key| store.read_tile(key).unwrap().map(|tile| (key, tile)))
+            .collect();
+        (Resident::new(store.index().clone()), tiles)
+    }
+
+    #[test]
+    fn found_empty_and_absent_are_told_apart() {
+        let (mut resident, tiles) = tiles();
+        assert_eq!(tiles.len(), 6);
+        let (key, tile) = tiles[1].clone();
+        assert!(matches!(resident.height(key), Lookup::Absent));
+        assert!(resident.insert(key, tile.clone()));
+        assert!(
+            matches!(resident.height(key), Lookup::Found(tile) if tile.post(0, 0) == hills(256, 0))
+        );
+        let void = TileKey { layer: 0, level: 0, tx: 2, ty: 1 };
+        assert!(matches!(resident.height(void), Lookup::Empty));
+        assert!(matches!(resident.height(TileKey { tx: 3, ..void }), Lookup::Empty));
+        let photo = tiles[5].0;
+        assert!(!resident.insert(photo, tile.clone()), "heights are no photo");
+        assert!(!resident.insert(TileKey { level: 9, ..key }, tile), "no such level");
+        assert!(matches!(resident.photo(photo), Lookup::Absent));
+        assert!(resident.insert(photo, tiles[5].1.clone()));
+        assert!(matches!(resident.photo(photo), Lookup::Found(_)));
+    }
+
+    #[test]
+    fn bytes_follow_every_change() {
+        let (mut resident, tiles) = tiles();
+        for (key, tile) in &tiles {
+            resident.insert(*key, tile.clone());
+            resident.insert(*key, tile.clone());
+        }
+        let expected: usize = tiles.iter().map(|(_, tile)| tile.memory_bytes()).sum();
+        assert_eq!(resident.bytes(), expected);
+        assert!(resident.loaded().eq(tiles.iter().map(|(key, _)| *key)));
+        for (key, _) in &tiles {
+            resident.remove(*key);
+            resident.remove(*key);
+        }
+        assert_eq!((resident.bytes(), resident.loaded().count()), (0, 0));
+    }
+
+    #[test]
+    fn what_is_unused_longest_goes_first_even_if_a_snapshot_used_it() {
+        let (mut resident, tiles) = tiles();
+        let keys: Vec<_> = tiles.iter().take(5).map(|(key, _)| *key).collect();
+        for (key, tile) in &tiles[..5] {
+            resident.insert(*key, tile.clone());
+            resident.next_round();
+        }
+        let snapshot = resident.clone();
+        snapshot.touch(keys[0]);
+        assert_eq!(resident.evict_to(5 * HEIGHT_TILE_BYTES), []);
+        assert_eq!(resident.evict_to(3 * HEIGHT_TILE_BYTES), [keys[1], keys[2]]);
+        assert!(matches!(resident.height(keys[1]), Lookup::Absent));
+        assert!(matches!(snapshot.height(keys[1]), Lookup::Found(_)), "a snapshot keeps its own");
+        assert_eq!(resident.evict_to(HEIGHT_TILE_BYTES + 1), [keys[3], keys[4]]);
+        assert_eq!(resident.evict_to(0), [keys[0]]);
+        assert_eq!(resident.bytes(), 0);
+    }
+
+    #[test]
+    fn age_survives_the_wrap_of_the_counter() {
+        let (mut resident, tiles) = tiles();
+        resident.uses.round.store(u32::MAX, Ordering::Relaxed);
+        resident.insert(tiles[1].0, tiles[1].1.clone());
+        resident.next_round();
+        resident.insert(tiles[0].0, tiles[0].1.clone());
+        assert_eq!(resident.evict_to(HEIGHT_TILE_BYTES), [tiles[1].0]);
     }
 }
