@@ -48,7 +48,6 @@ pub trait Caster: Send + Sync + 'static {
 }
 
 /// The terrain as a job sees it.
-#[derive(Debug)]
 pub struct Scene<P> {
     /// The tiles in memory.
     pub resident: Arc<Resident>,
@@ -141,7 +140,8 @@ impl<C: Caster> Job<C> {
         let began = Instant::now();
         let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene)));
         self.spent += began.elapsed();
-        let missing = missing.map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?;
+        let missing =
+            missing.map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?;
         if self.stop.load(Ordering::Relaxed) {
             return Ok(Outcome::Stopped);
         }

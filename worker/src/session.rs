@@ -280,7 +280,9 @@ impl Session {
     }
 
     fn pause(&mut self, lease: LeaseId, missing: Vec<BlobHash>) {
-        let Some(job) = self.current.as_mut().filter(|job| job.grant.lease == lease) else { return };
+        let Some(job) = self.current.as_mut().filter(|job| job.grant.lease == lease) else {
+            return;
+        };
         match job.phase {
             Phase::Rendering => {
                 job.phase = Phase::Waiting(missing.iter().copied().collect());

@@ -16,7 +16,6 @@ use terrafarm_terrain::resident::{Resident, Tile};
 const IDLE_STORES_MAX: usize = 4;
 
 /// All terrain in memory. `P` is what the ray caster works out for each store.
-#[derive(Debug)]
 pub struct Terrain<P> {
     stores: BTreeMap<BlobHash, Store<P>>,
     /// Places that wait for a tile, by its hash. The same tile may lie at many: sea does.
@@ -31,7 +30,6 @@ pub struct Terrain<P> {
     idle: VecDeque<BlobHash>,
 }
 
-#[derive(Debug)]
 struct Store<P> {
     resident: Arc<Resident>,
     prepared: Arc<P>,
