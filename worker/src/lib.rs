@@ -1,1 +1,220 @@
-//! The worker: session, link, render pool, blob cache.
+//! The worker: takes jobs from a coordinator, renders them on all cores, sends pixels.
+//!
+//! [`run`] is the whole of it. Read in this order: [`session`] decides what to do about
+//! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
+//! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
+//! the session asks for over one connection; `backoff` says when to try again.
+//!
+//! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
+//! grants its leases to others. It needs no file but the tile cache, and works without.
+//! Rendering and decoding happen on a thread pool of its own, never on the threads that
+//! answer heartbeats.
+
+mod backoff;
+pub mod render;
+pub mod session;
+mod shift;
+pub mod terrain;
+
+pub use backoff::Reconnect;
+pub use render::{Caster, RayCaster};
+
+use backoff::Backoff;
+use shift::{Shift, Site};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+use terrafarm_terrain::cache::BlobCache;
+use terrafarm_wire::link::{Connection, HandshakeError, greet};
+use terrafarm_wire::message::{Hello, Role, Welcome};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+
+/// How long connecting may take, and the greeting after it.
+const CONNECT_LIMIT: Duration = Duration::from_secs(10);
+
+/// What a worker needs to know.
+#[derive(Debug, Clone)]
+pub struct WorkerConfig {
+    /// Address of the coordinator, `host:port`.
+    pub coordinator: String,
+    /// What to call this worker; a host name, usually.
+    pub name: String,
+    /// Number of render threads, at least 1.
+    pub threads: usize,
+    /// Where fetched terrain is kept between runs; several workers may share it. Without
+    /// one, each start fetches anew.
+    pub cache_dir: Option<PathBuf>,
+    /// Size of that folder, bytes.
+    pub cache_limit_bytes: u64,
+    /// Memory for decoded terrain, bytes. A height tile takes 0.4 MB, a photo tile 0.5 MB;
+    /// a job whose own tiles take more fails.
+    pub memory_limit_bytes: u64,
+    /// What to do when there is no connection.
+    pub reconnect: Reconnect,
+    /// A number of this process: the worker's incarnation and the seed of its back-off.
+    /// Two workers should have different ones.
+    pub seed: u64,
+}
+
+/// Why a worker has ended without an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// It was told to stop; every lease is answered.
+    Stopped,
+    /// The coordinator sent it away; every lease is answered.
+    Drained,
+}
+
+/// Why a worker could not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum WorkerError {
+    /// The coordinator cannot be reached, and [`Reconnect`] says to give up.
+    #[error(
+        "cannot reach coordinator {address}: {why}; is \"terrafarm coordinator\" running there, and the port open?"
+    )]
+    Unreachable {
+        /// The address that was tried.
+        address: String,
+        /// What the system or the peer said last.
+        why: String,
+    },
+    /// The coordinator does not want this worker; trying again cannot help.
+    #[error("coordinator {address} refuses this worker: {text}")]
+    Refused {
+        /// The address of the coordinator.
+        address: String,
+        /// Why, and what to do.
+        text: String,
+    },
+    /// The operating system gives no threads.
+    #[error("cannot start {threads} render threads: {why}; try fewer")]
+    Threads {
+        /// How many were asked for.
+        threads: usize,
+        /// What the system said.
+        why: String,
+    },
+}
+
+/// Works until `shutdown` completes or the coordinator sends the worker away.
+///
+/// On shutdown the job that runs is finished and sent, the others are handed back.
+pub async fn run(
+    config: WorkerConfig,
+    shutdown: impl Future<Output = ()>,
+) -> Result<Ended, WorkerError> {
+    run_with(config, RayCaster, shutdown).await
+}
+
+/// As [`run`], with another way to cast rays.
+pub async fn run_with<C: Caster>(
+    config: WorkerConfig,
+    caster: C,
+    shutdown: impl Future<Output = ()>,
+) -> Result<Ended, WorkerError> {
+    let stop = CancellationToken::new();
+    let work = work(config, caster, stop.clone());
+    tokio::pin!(work);
+    tokio::select! {
+        ended = &mut work => return ended,
+        () = shutdown => stop.cancel(),
+    }
+    work.await
+}
+
+async fn work<C: Caster>(
+    config: WorkerConfig,
+    caster: C,
+    stop: CancellationToken,
+) -> Result<Ended, WorkerError> {
+    let mut site = site(&config, caster).await?;
+    let mut backoff = Backoff::new(config.reconnect, config.seed);
+    loop {
+        let why = match connect(&config, &stop).await {
+            Ok(None) => return Ok(Ended::Stopped),
+            Ok(Some((connection, welcome, peer))) => {
+                info!(coordinator = welcome.coordinator, peer = %peer, "connected");
+                backoff.reset();
+                let shift = Shift::new(&mut site, !peer.ip().is_loopback(), &welcome);
+                match shift.work(connection, &stop).await {
+                    Ok(()) if stop.is_cancelled() => return Ok(Ended::Stopped),
+                    Ok(()) => return Ok(Ended::Drained),
+                    Err(lost) => lost.to_string(),
+                }
+            }
+            Err(HandshakeError::Refused { refusal, text }) if !refusal.is_temporary() => {
+                let address = config.coordinator;
+                return Err(WorkerError::Refused { address, text });
+            }
+            Err(error) => error.to_string(),
+        };
+        let Some(pause) = backoff.next() else {
+            let address = config.coordinator;
+            return Err(WorkerError::Unreachable { address, why });
+        };
+        warn!(why, retry_in_ms = pause.as_millis() as u64, "no connection to the coordinator");
+        tokio::select! {
+            () = tokio::time::sleep(pause) => {}
+            () = stop.cancelled() => return Ok(Ended::Stopped),
+        }
+    }
+}
+
+/// The threads, the caches: what outlives a connection.
+async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, WorkerError> {
+    let threads = config.threads.max(1);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .thread_name(|number| format!("render-{number}"))
+        .build()
+        .map_err(|error| WorkerError::Threads { threads, why: error.to_string() })?;
+    let cache = match config.cache_dir.clone() {
+        None => None,
+        Some(folder) => {
+            let limit = config.cache_limit_bytes;
+            let opening = tokio::task::spawn_blocking(move || BlobCache::open(&folder, limit));
+            match opening.await {
+                Ok(Ok(cache)) => Some(Arc::new(cache)),
+                Ok(Err(error)) => {
+                    warn!(%error, "working without a tile cache");
+                    None
+                }
+                Err(_) => None,
+            }
+        }
+    };
+    let terrain = terrain::Terrain::new(config.memory_limit_bytes);
+    Ok(Site { pool, cache, terrain, caster: Arc::new(caster) })
+}
+
+type Connected = (Connection<TcpStream>, Welcome, SocketAddr);
+
+/// A greeted connection; `None` if the worker is told to stop meanwhile.
+async fn connect(
+    config: &WorkerConfig,
+    stop: &CancellationToken,
+) -> Result<Option<Connected>, HandshakeError> {
+    let attempt = async {
+        let connecting = timeout(CONNECT_LIMIT, TcpStream::connect(&config.coordinator));
+        let stream = connecting.await.map_err(|_| HandshakeError::TimedOut(CONNECT_LIMIT))?;
+        let stream = stream.map_err(terrafarm_wire::link::LinkError::Io)?;
+        let peer = stream.peer_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
+        // Small messages must not wait for others to fill a packet.
+        if let Err(error) = stream.set_nodelay(true) {
+            warn!(%error, "the connection stays slow for small messages");
+        }
+        let threads = config.threads.max(1) as u32;
+        let role = Role::Worker { threads, incarnation: config.seed };
+        let hello = Hello::new(&config.name, role);
+        let (connection, welcome) = greet(stream, hello, CONNECT_LIMIT).await?;
+        Ok((connection, welcome, peer))
+    };
+    tokio::select! {
+        connected = attempt => connected.map(Some),
+        () = stop.cancelled() => Ok(None),
+    }
+}

@@ -21,6 +21,7 @@ use bytes::{Buf, BytesMut};
 use std::io;
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
+use tokio::time::{Instant, timeout_at};
 
 /// Why a connection has ended other than cleanly.
 #[derive(Debug, thiserror::Error)]
@@ -55,7 +56,12 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
         let (read, write) = tokio::io::split(stream);
         let decoder = Decoder::new(Phase::Greeting);
         Connection {
-            reader: Reader { stream: read, buffer: BytesMut::new(), decoder },
+            reader: Reader {
+                stream: read,
+                buffer: BytesMut::new(),
+                decoder,
+                heard: Instant::now(),
+            },
             writer: Writer { stream: write, version: NEWEST_VERSION },
         }
     }
@@ -88,6 +94,8 @@ pub struct Reader<R> {
     stream: R,
     buffer: BytesMut,
     decoder: Decoder,
+    /// When the last byte came.
+    heard: Instant,
 }
 
 impl<R: AsyncRead + Unpin> Reader<R> {
@@ -98,8 +106,9 @@ impl<R: AsyncRead + Unpin> Reader<R> {
         self.next(None).await
     }
 
-    /// As [`Reader::recv`], but fails with [`LinkError::Silent`] when not one byte comes
-    /// for so long. A long message that trickles in is not silence.
+    /// As [`Reader::recv`], but fails with [`LinkError::Silent`] when not one byte has come
+    /// for so long, cancelled calls included. A long message that trickles in is not
+    /// silence.
     pub async fn recv_within(&mut self, silence: Duration) -> Result<Option<Message>, LinkError> {
         self.next(Some(silence)).await
     }
@@ -112,14 +121,16 @@ impl<R: AsyncRead + Unpin> Reader<R> {
             let read = self.stream.read_buf(&mut self.buffer);
             let count = match silence {
                 None => read.await?,
-                Some(limit) => tokio::time::timeout(limit, read)
-                    .await
-                    .map_err(|_| LinkError::Silent(limit))??,
+                Some(limit) => {
+                    let silent = self.heard + limit;
+                    timeout_at(silent, read).await.map_err(|_| LinkError::Silent(limit))??
+                }
             };
             if count == 0 {
                 let clean = self.buffer.is_empty() && !self.decoder.is_inside_message();
                 return if clean { Ok(None) } else { Err(LinkError::Cut) };
             }
+            self.heard = Instant::now();
         }
     }
 }

@@ -193,6 +193,26 @@ async fn silence_is_noticed_and_a_trickle_is_not_silence() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn silence_is_noticed_although_the_receive_is_cancelled_all_the_time() {
+    let (worker, _coordinator) = connect(memory()).await;
+    let (mut reader, _writer) = worker.split();
+    let began = tokio::time::Instant::now();
+    let silence = Duration::from_secs(3);
+    loop {
+        tokio::select! {
+            biased;
+            lost = reader.recv_within(silence) => {
+                assert!(matches!(lost, Err(LinkError::Silent(_))));
+                break;
+            }
+            () = tokio::time::sleep(Duration::from_secs(1)) => {
+                assert!(began.elapsed() <= silence, "silent for {:?}", began.elapsed());
+            }
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_cancelled_receive_loses_nothing() {
     let (worker, coordinator) = connect(memory()).await;
     let (mut reader, _keep) = worker.split();

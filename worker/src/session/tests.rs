@@ -1,0 +1,389 @@
+//! The session against a scripted and a random world.
+
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use glam::DVec3;
+use proptest::prelude::*;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Region;
+use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_wire::message::{CloseShot, Drain, RenderReport, Revoke};
+use terrafarm_wire::pixels::Pixels;
+
+const INDEX: BlobHash = BlobHash([1; 32]);
+
+fn tile(number: u8) -> BlobHash {
+    BlobHash([100 + number; 32])
+}
+
+fn open(shot: u64) -> Event {
+    let shading = Shading {
+        sun: None,
+        haze: None,
+        sky: Sky::default(),
+        earth: None,
+        below_ground: [0.0; 3],
+        bare_ground: None,
+    };
+    let quality = Quality::default();
+    let shot = ShotId(shot);
+    Event::Received(OpenShot { shot, index: INDEX, shading, quality, width: 8, height: 4 }.into())
+}
+
+fn grant(lease: u64, shot: u64) -> Event {
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, (8, 4));
+    let region = Region::whole(8, 4);
+    let (lease, shot) = (LeaseId(lease), ShotId(shot));
+    Event::Received(Grant { lease, shot, frame: 0, region, camera }.into())
+}
+
+fn revoke(lease: u64) -> Event {
+    Event::Received(Revoke { lease: LeaseId(lease) }.into())
+}
+
+fn blob(hash: BlobHash) -> Blob {
+    Blob { hash, bytes: Default::default() }
+}
+
+fn done(lease: u64) -> Done {
+    let pixels = Pixels::raw(vec![0; 96].into()).unwrap();
+    Done { lease: LeaseId(lease), report: RenderReport::default(), pixels }
+}
+
+/// What the session wants after these events, in short.
+fn after(session: &mut Session, events: impl IntoIterator<Item = Event>) -> Vec<String> {
+    events.into_iter().for_each(|event| session.handle(event));
+    std::iter::from_fn(|| session.poll_action()).map(|action| short(&action)).collect()
+}
+
+fn short(action: &Action) -> String {
+    match action {
+        Action::Send(Message::WantBlobs(want)) => format!("want {}", want.hashes.len()),
+        Action::Send(Message::Done(done)) => format!("done {}", done.lease),
+        Action::Send(Message::Failed(failed)) => {
+            format!("failed {}: {}", failed.lease, failed.reason)
+        }
+        Action::Send(Message::HandBack(back)) => format!("hand back {}", back.leases.len()),
+        Action::Send(Message::Goodbye(_)) => "goodbye".to_owned(),
+        Action::Send(other) => format!("send {other:?}"),
+        Action::Load(hash) => format!("load {hash}"),
+        Action::Take(blob) => format!("take {}", blob.hash),
+        Action::Start(grant, _) => format!("start {}", grant.lease),
+        Action::Resume(lease) => format!("resume {lease}"),
+        Action::Stop(lease) => format!("stop {lease}"),
+        Action::Discard(lease) => format!("discard {lease}"),
+        Action::Release(_) => "release".to_owned(),
+        Action::End => "end".to_owned(),
+    }
+}
+
+/// A session in which `lease-1` renders and `lease-2` waits.
+fn rendering() -> Session {
+    let mut session = Session::new();
+    let wants = after(&mut session, [open(1), grant(1, 1), grant(2, 1)]);
+    assert_eq!(wants, [format!("load {INDEX}")]);
+    assert_eq!(after(&mut session, [Event::Loaded(INDEX)]), ["start lease-1"]);
+    session
+}
+
+#[test]
+fn a_job_waits_for_the_index_then_renders_then_is_sent_and_the_next_begins() {
+    let mut session = rendering();
+    assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
+    assert_eq!(after(&mut session, [Event::Sent]), [format!("load {INDEX}")]);
+    assert_eq!(after(&mut session, [Event::Loaded(INDEX)]), ["start lease-2"]);
+}
+
+#[test]
+fn missing_tiles_are_looked_for_here_then_asked_for_once() {
+    let mut session = rendering();
+    let wants = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1), tile(2)])]);
+    assert_eq!(wants, [format!("load {}", tile(1)), format!("load {}", tile(2))]);
+    assert!(after(&mut session, [Event::Loaded(tile(1))]).is_empty());
+    assert_eq!(after(&mut session, [Event::Absent(tile(2))]), ["want 1"]);
+    assert!(after(&mut session, [Event::Absent(tile(2))]).is_empty(), "asked once");
+    let taken = after(&mut session, [Event::Received(blob(tile(2)).into())]);
+    assert_eq!(taken, [format!("take {}", tile(2))]);
+    assert_eq!(after(&mut session, [Event::Loaded(tile(2))]), ["resume lease-1"]);
+}
+
+#[test]
+fn a_blob_that_cannot_be_had_fails_the_job_with_the_reason() {
+    let mut session = rendering();
+    after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1)]), Event::Absent(tile(1))]);
+    let no = NoBlob { hash: tile(1), why: "the client has left".to_owned() };
+    let said = after(&mut session, [Event::Received(no.into())]);
+    assert_eq!(said[0], "discard lease-1");
+    assert!(said[1].starts_with("failed lease-1: ") && said[1].ends_with("the client has left"));
+    assert_eq!(said[2], format!("load {INDEX}"), "the next one begins");
+}
+
+#[test]
+fn blobs_that_nobody_asked_for_are_dropped() {
+    let mut session = rendering();
+    assert!(after(&mut session, [Event::Received(blob(tile(9)).into())]).is_empty());
+    let no = NoBlob { hash: tile(9), why: String::new() };
+    assert!(after(&mut session, [Event::Received(no.into())]).is_empty());
+}
+
+#[test]
+fn a_revoked_job_is_stopped_and_its_late_result_is_not_sent() {
+    let mut session = rendering();
+    assert_eq!(after(&mut session, [revoke(1)]), ["stop lease-1"]);
+    let next = after(&mut session, [Event::Rendered(done(1))]);
+    assert_eq!(next, [format!("load {INDEX}")], "no result, the next one");
+    assert!(after(&mut session, [revoke(1), Event::Rendered(done(1))]).is_empty());
+}
+
+#[test]
+fn a_revoked_lease_in_the_queue_is_forgotten_without_an_answer() {
+    let mut session = rendering();
+    assert!(after(&mut session, [revoke(2)]).is_empty());
+    assert_eq!(after(&mut session, [Event::Rendered(done(1)), Event::Sent]), ["done lease-1"]);
+}
+
+#[test]
+fn leaving_hands_back_what_waits_finishes_what_runs_and_says_goodbye() {
+    let mut session = rendering();
+    let leave = || Event::Received(Drain {}.into());
+    assert_eq!(after(&mut session, [leave(), leave()]), ["hand back 1"]);
+    assert_eq!(after(&mut session, [grant(3, 1)]), ["hand back 1"]);
+    assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
+    assert_eq!(after(&mut session, [Event::Sent]), ["goodbye", "end"]);
+    assert!(after(&mut session, [grant(4, 1), Event::Sent]).is_empty());
+}
+
+#[test]
+fn an_idle_worker_leaves_at_once() {
+    let mut session = Session::new();
+    assert_eq!(after(&mut session, [Event::Leave("told".into())]), ["goodbye", "end"]);
+}
+
+#[test]
+fn grants_that_make_no_sense_fail_with_a_reason() {
+    let mut session = Session::new();
+    let said = after(&mut session, [grant(1, 7)]);
+    assert_eq!(said, ["failed lease-1: shot-7 has not been opened here"]);
+    let Event::Received(Message::Grant(mut other)) = grant(2, 1) else { unreachable!() };
+    other.camera.width = 16;
+    let said = after(&mut session, [open(1), Event::Received(other.into())]);
+    assert!(said[0].starts_with("failed lease-2: the camera has 16 x 4 pixels"), "{said:?}");
+}
+
+#[test]
+fn the_same_lease_twice_is_one_job() {
+    let mut session = rendering();
+    assert!(after(&mut session, [grant(1, 1), grant(2, 1)]).is_empty());
+}
+
+#[test]
+fn a_closed_shot_gives_its_waiting_grants_back_and_its_store_free() {
+    let mut session = rendering();
+    let close = Event::Received(CloseShot { shot: ShotId(1) }.into());
+    assert_eq!(after(&mut session, [close]), ["hand back 1", "release"]);
+    assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
+}
+
+#[test]
+fn a_slow_link_holds_rendering_back() {
+    let mut session = rendering();
+    assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
+    assert!(after(&mut session, [grant(3, 1)]).is_empty(), "not before the first is sent");
+    assert_eq!(after(&mut session, [Event::Sent]).len(), 1);
+}
+
+#[test]
+fn thousands_of_missing_tiles_are_asked_for_a_few_at_a_time() {
+    let mut session = rendering();
+    let hash =
+        |i: u16| BlobHash(std::array::from_fn(|at| if at < 2 { i.to_le_bytes()[at] } else { 7 }));
+    let missing: Vec<_> = (0..3000).map(hash).collect();
+    after(&mut session, [Event::Paused(LeaseId(1), missing.clone())]);
+    let mut asked = Vec::new();
+    let mut outstanding = 0;
+    for &hash in &missing {
+        session.handle(Event::Absent(hash));
+    }
+    loop {
+        while let Some(action) = session.poll_action() {
+            match action {
+                Action::Send(Message::WantBlobs(want)) => {
+                    outstanding += want.hashes.len();
+                    assert!(outstanding <= ASKED_MAX);
+                    asked.extend(want.hashes);
+                }
+                Action::Take(blob) => session.handle(Event::Loaded(blob.hash)),
+                Action::Resume(_) => {
+                    asked.sort_unstable();
+                    asked.dedup();
+                    assert_eq!(asked.len(), missing.len());
+                    return;
+                }
+                _ => {}
+            }
+        }
+        let next = asked[asked.len() - outstanding];
+        outstanding -= 1;
+        session.handle(Event::Received(blob(next).into()));
+    }
+}
+
+/// A world that answers in any order, and keeps the rules in view.
+#[derive(Default)]
+struct World {
+    /// Granted, not answered, not revoked.
+    held: BTreeSet<u64>,
+    answered: BTreeSet<u64>,
+    memory: BTreeSet<BlobHash>,
+    loading: Vec<BlobHash>,
+    asked: Vec<BlobHash>,
+    running: Option<u64>,
+    paused: Option<u64>,
+    needs: BTreeSet<BlobHash>,
+    unsent: usize,
+    ended: bool,
+}
+
+impl World {
+    fn carry_out(&mut self, session: &mut Session) {
+        while let Some(action) = session.poll_action() {
+            assert!(!self.ended, "{action:?} after the end");
+            match action {
+                Action::Send(message) => self.hear(&message),
+                Action::Load(hash) => {
+                    assert!(!self.loading.contains(&hash), "loaded twice");
+                    self.loading.push(hash);
+                }
+                Action::Take(blob) => self.loading.push(blob.hash),
+                Action::Start(grant, shot) => {
+                    assert!(self.memory.contains(&shot.index), "no render before its index");
+                    assert_eq!((self.running, self.paused), (None, None), "one job at a time");
+                    self.running = Some(grant.lease.0);
+                }
+                Action::Resume(lease) => {
+                    assert!(self.needs.is_subset(&self.memory), "no render before its tiles");
+                    assert_eq!((self.running, self.paused.take()), (None, Some(lease.0)));
+                    self.running = Some(lease.0);
+                }
+                Action::Stop(lease) => assert_eq!(self.running, Some(lease.0)),
+                Action::Discard(lease) => assert_eq!(self.paused.take(), Some(lease.0)),
+                Action::Release(_) => {}
+                Action::End => {
+                    assert!(self.held.is_empty() && self.unsent == 0, "left with {:?}", self.held);
+                    self.ended = true;
+                }
+            }
+        }
+    }
+
+    fn hear(&mut self, message: &Message) {
+        match message {
+            Message::Done(done) => {
+                self.unsent += 1;
+                self.answer(done.lease.0);
+            }
+            Message::Failed(failed) => self.answer(failed.lease.0),
+            Message::HandBack(back) => back.leases.iter().for_each(|lease| self.answer(lease.0)),
+            Message::WantBlobs(want) => {
+                for hash in &want.hashes {
+                    assert!(!self.asked.contains(hash), "asked twice");
+                    self.asked.push(*hash);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn answer(&mut self, lease: u64) {
+        assert!(self.held.remove(&lease), "lease-{lease} is not held");
+        assert!(self.answered.insert(lease), "lease-{lease} answered twice");
+    }
+
+    /// The next event of a kind that is possible now.
+    fn event(&mut self, kind: u8, pick: u8, next_lease: &mut u64) -> Option<Event> {
+        let pick_of = |list: &mut Vec<BlobHash>| {
+            (!list.is_empty()).then(|| list.swap_remove(usize::from(pick) % list.len()))
+        };
+        let from_pool = |world: &mut World| world.running.take().map(LeaseId);
+        match kind {
+            0..=3 => {
+                *next_lease += 1;
+                self.held.insert(*next_lease);
+                Some(grant(*next_lease, 1 + u64::from(pick % 3)))
+            }
+            4 => Some(open(1 + u64::from(pick % 3))),
+            5 => Some(Event::Received(CloseShot { shot: ShotId(1 + u64::from(pick % 3)) }.into())),
+            6 => {
+                let lease = *self.held.iter().nth(usize::from(pick) % self.held.len().max(1))?;
+                self.held.remove(&lease);
+                Some(revoke(lease))
+            }
+            7 | 8 => pick_of(&mut self.loading).map(|hash| {
+                self.memory.insert(hash);
+                Event::Loaded(hash)
+            }),
+            9 => pick_of(&mut self.loading).map(Event::Absent),
+            10 => pick_of(&mut self.loading).map(|hash| Event::Spoiled(hash, "torn".into())),
+            11 | 12 => pick_of(&mut self.asked).map(|hash| Event::Received(blob(hash).into())),
+            13 => pick_of(&mut self.asked)
+                .map(|hash| Event::Received(NoBlob { hash, why: "gone".into() }.into())),
+            14 => from_pool(self).map(|lease| {
+                self.paused = Some(lease.0);
+                self.needs = (0..1 + pick % 4).map(|i| tile(i + pick % 16)).collect();
+                self.needs.iter().for_each(|hash| {
+                    self.memory.remove(hash);
+                });
+                Event::Paused(lease, self.needs.iter().copied().collect())
+            }),
+            15 | 16 => from_pool(self).map(|lease| Event::Rendered(done(lease.0))),
+            17 => from_pool(self).map(|lease| Event::Broken(lease, "panic".into())),
+            18 | 19 if self.unsent > 0 => {
+                self.unsent -= 1;
+                Some(Event::Sent)
+            }
+            20 if pick < 8 => Some(Event::Leave("told".into())),
+            _ => None,
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 2000, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_happens_every_lease_is_answered_once_and_one_job_runs(
+        script in prop::collection::vec((0u8..=20, any::<u8>()), 0..150),
+    ) {
+        let (mut session, mut world, mut lease) = (Session::new(), World::default(), 0);
+        session.handle(open(1));
+        for (kind, pick) in script {
+            if world.ended {
+                break;
+            }
+            if let Some(event) = world.event(kind, pick, &mut lease) {
+                session.handle(event);
+                world.carry_out(&mut session);
+            }
+        }
+        // From here on the world is kind, and everything comes to an end.
+        if !world.ended {
+            session.handle(Event::Leave("told".into()));
+            world.carry_out(&mut session);
+        }
+        for _ in 0..2000 {
+            for kind in [7, 11, 15, 18] {
+                if let Some(event) = world.event(kind, 0, &mut lease) {
+                    session.handle(event);
+                    world.carry_out(&mut session);
+                }
+            }
+            if world.ended {
+                break;
+            }
+        }
+        prop_assert!(world.ended, "still held: {:?}", world.held);
+        prop_assert!(world.held.is_empty());
+    }
+}

@@ -1,0 +1,376 @@
+//! One shift: a worker's time on one connection, from the welcome to the goodbye.
+//!
+//! The shell around the [`Session`]: it carries out what the session asks for and tells
+//! it what came of it. Everything slow happens elsewhere (rendering, decoding and disk on
+//! the thread pool, writing in a task of its own), so that a heartbeat is answered at
+//! once whatever else goes on.
+
+use crate::render::{Caster, Job, Outcome, Picture, said};
+use crate::session::{Action, Event, Session};
+use crate::terrain::Terrain;
+use bytes::Bytes;
+use rayon::ThreadPool;
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+use terrafarm_common::id::{BlobHash, LeaseId};
+use terrafarm_raycast::View;
+use terrafarm_terrain::cache::BlobCache;
+use terrafarm_terrain::codec;
+use terrafarm_terrain::resident::{Resident, Tile};
+use terrafarm_terrain::store::{decode_index, hash_of};
+use terrafarm_wire::Message;
+use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
+use terrafarm_wire::message::{Blob, Done, Grant, OpenShot, Pong, RenderReport, Welcome};
+use terrafarm_wire::pixels::Pixels;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, warn};
+
+/// Small messages that may wait for the writer.
+const URGENT_MAX: usize = 256;
+/// Pictures that may wait for the writer: one on its way, one behind it.
+const BULK_MAX: usize = 2;
+/// Answers of the thread pool that may wait; more hold the pool back.
+const REPORTS_MAX: usize = 64;
+
+/// What outlives a connection.
+pub(crate) struct Site<C: Caster> {
+    pub pool: ThreadPool,
+    pub cache: Option<Arc<BlobCache>>,
+    pub terrain: Terrain<C::Prepared>,
+    pub caster: Arc<C>,
+}
+
+/// What the thread pool has done.
+enum Report<C: Caster> {
+    Absent(BlobHash),
+    Spoiled(BlobHash, String),
+    Index(BlobHash, Box<Resident>, C::Prepared),
+    Tile(BlobHash, Tile),
+    Done(Done),
+    Missing(Job<C>, Vec<terrafarm_terrain::layout::TileKey>),
+    Stopped(LeaseId),
+    Broken(LeaseId, String),
+}
+
+/// A worker on one connection.
+pub(crate) struct Shift<'a, C: Caster> {
+    site: &'a mut Site<C>,
+    session: Session,
+    compress: bool,
+    silence: Duration,
+    /// The store of the job that is begun, and how to stop it.
+    current: Option<(BlobHash, Arc<AtomicBool>)>,
+    paused: Option<Job<C>>,
+    /// What the outbox had no room for, in order.
+    backlog: VecDeque<Message>,
+    ended: bool,
+    reports: mpsc::Sender<Report<C>>,
+    reported: mpsc::Receiver<Report<C>>,
+}
+
+impl<'a, C: Caster> Shift<'a, C> {
+    /// A shift that has not begun. `compress` packs pixels for a network.
+    pub fn new(site: &'a mut Site<C>, compress: bool, welcome: &Welcome) -> Self {
+        let (reports, reported) = mpsc::channel(REPORTS_MAX);
+        Shift {
+            site,
+            session: Session::new(),
+            compress,
+            silence: Duration::from_micros(welcome.silence_us),
+            current: None,
+            paused: None,
+            backlog: VecDeque::new(),
+            ended: false,
+            reports,
+            reported,
+        }
+    }
+
+    /// Works until every lease is answered and the worker may leave, or until the
+    /// connection is lost, which is the error.
+    pub async fn work<S>(
+        mut self,
+        connection: Connection<S>,
+        stop: &CancellationToken,
+    ) -> Result<(), LinkError>
+    where
+        S: AsyncRead + AsyncWrite + Send + 'static,
+    {
+        let (mut reader, writer) = connection.split();
+        let (outbox, queues) = outbox(URGENT_MAX, BULK_MAX);
+        let mut writing = tokio::spawn(writer.run(queues));
+        let mut asked_to_stop = false;
+        while !(self.ended && self.backlog.is_empty()) {
+            let waiting = self.backlog.front().cloned();
+            let event = tokio::select! {
+                received = reader.recv_within(self.silence) => match received {
+                    Ok(Some(message)) => self.received(message, &outbox),
+                    Ok(None) => Err(LinkError::Closed),
+                    Err(lost) => Err(lost),
+                },
+                Some(report) = self.reported.recv() => Ok(Some(self.judge(report))),
+                sent = send_waiting(&outbox, waiting) => sent.map(|()| {
+                    matches!(self.backlog.pop_front(), Some(Message::Done(_))).then_some(Event::Sent)
+                }),
+                () = stop.cancelled(), if !asked_to_stop => {
+                    asked_to_stop = true;
+                    Ok(Some(Event::Leave("the worker was told to stop".to_owned())))
+                }
+                written = &mut writing => Err(written.ok().and_then(Result::err).unwrap_or(LinkError::Closed)),
+            };
+            match event {
+                Ok(Some(event)) => self.handle(event, &outbox),
+                Ok(None) => {}
+                Err(lost) => {
+                    self.stop_current();
+                    writing.abort();
+                    return Err(lost);
+                }
+            }
+        }
+        drop(outbox);
+        // The farewell is worth as much time as any other message.
+        match tokio::time::timeout(self.silence, &mut writing).await {
+            Ok(_) => {}
+            Err(_) => writing.abort(),
+        }
+        Ok(())
+    }
+
+    /// A message as an event; heartbeats are answered here.
+    fn received(&self, message: Message, outbox: &Outbox) -> Result<Option<Event>, LinkError> {
+        match message {
+            Message::Ping(ping) => {
+                // A full lane means that the coordinator will hear from us in any case.
+                if outbox.try_send(Pong { number: ping.number }) == Err(Unsent::Closed) {
+                    return Err(LinkError::Closed);
+                }
+                Ok(None)
+            }
+            Message::Goodbye(_) => Err(LinkError::Closed),
+            message => Ok(Some(Event::Received(message))),
+        }
+    }
+
+    fn handle(&mut self, event: Event, outbox: &Outbox) {
+        self.session.handle(event);
+        while let Some(action) = self.session.poll_action() {
+            let outcome = match action {
+                Action::Send(message) => self.send(message, outbox),
+                Action::Load(hash) => self.load(hash),
+                Action::Take(blob) => self.take(blob),
+                Action::Start(grant, shot) => self.start(&grant, &shot),
+                Action::Resume(lease) => self.resume(lease),
+                Action::Stop(_) => {
+                    self.stop_current();
+                    None
+                }
+                Action::Discard(_) => {
+                    self.paused = None;
+                    None
+                }
+                Action::Release(store) => {
+                    self.site.terrain.release(store);
+                    None
+                }
+                Action::End => {
+                    self.ended = true;
+                    None
+                }
+            };
+            if let Some(event) = outcome {
+                self.session.handle(event);
+            }
+        }
+    }
+
+    /// Sends now if there is room, later otherwise.
+    fn send(&mut self, message: Message, outbox: &Outbox) -> Option<Event> {
+        let is_done = matches!(message, Message::Done(_));
+        if self.backlog.is_empty() && outbox.try_send(message.clone()).is_ok() {
+            return is_done.then_some(Event::Sent);
+        }
+        self.backlog.push_back(message);
+        None
+    }
+
+    fn load(&mut self, hash: BlobHash) -> Option<Event> {
+        if self.site.terrain.has_store(hash) {
+            return Some(Event::Loaded(hash));
+        }
+        let Some(cache) = self.site.cache.clone() else {
+            return Some(Event::Absent(hash));
+        };
+        let (caster, is_tile) = (self.site.caster.clone(), self.site.terrain.is_tile(hash));
+        self.spawn(
+            move || match cache.get(&hash) {
+                Some(bytes) => decoded(&*caster, hash, &bytes, is_tile),
+                None => Report::Absent(hash),
+            },
+            move |panic| Report::Spoiled(hash, panic),
+        );
+        None
+    }
+
+    fn take(&mut self, blob: Blob) -> Option<Event> {
+        let Blob { hash, bytes } = blob;
+        let (caster, is_tile) = (self.site.caster.clone(), self.site.terrain.is_tile(hash));
+        let cache = self.site.cache.clone();
+        let keep = move |bytes: &Bytes| {
+            if let Some(Err(error)) = cache.map(|cache| cache.put(&hash, bytes)) {
+                warn!(%error, "a terrain blob was not kept");
+            }
+        };
+        self.spawn(
+            move || {
+                if hash_of(&bytes) != hash {
+                    return Report::Spoiled(hash, "what came has another hash".to_owned());
+                }
+                let report = decoded(&*caster, hash, &bytes, is_tile);
+                if !matches!(report, Report::Spoiled(..)) {
+                    keep(&bytes);
+                }
+                report
+            },
+            move |panic| Report::Spoiled(hash, panic),
+        );
+        None
+    }
+
+    fn start(&mut self, grant: &Grant, shot: &OpenShot) -> Option<Event> {
+        debug!(lease = %grant.lease, shot = %grant.shot, frame = grant.frame, "job begins");
+        self.site.terrain.begin_job();
+        let stop = Arc::new(AtomicBool::new(false));
+        self.current = Some((shot.index, stop.clone()));
+        let view =
+            View { camera: grant.camera, shading: shot.shading.clone(), quality: shot.quality };
+        self.paused = Some(Job::new(&*self.site.caster, grant.lease, view, grant.region, stop));
+        self.resume(grant.lease)
+    }
+
+    fn resume(&mut self, lease: LeaseId) -> Option<Event> {
+        let scene = self.current.as_ref().and_then(|(store, _)| self.site.terrain.scene(*store));
+        let (Some(job), Some(scene)) = (self.paused.take(), scene) else {
+            return Some(Event::Broken(lease, "its terrain is no longer in memory".to_owned()));
+        };
+        let (caster, compress) = (self.site.caster.clone(), self.compress);
+        self.spawn(
+            move || {
+                let outcome = job.advance(&*caster, &scene);
+                // The tiles are free to change before anyone hears of the outcome.
+                drop(scene);
+                match outcome {
+                    Ok(Outcome::Done(picture)) => match packed(lease, picture, compress) {
+                        Ok(done) => Report::Done(done),
+                        Err(why) => Report::Broken(lease, why),
+                    },
+                    Ok(Outcome::Missing(job, keys)) => Report::Missing(job, keys),
+                    Ok(Outcome::Stopped) => Report::Stopped(lease),
+                    Err(why) => Report::Broken(lease, why),
+                }
+            },
+            move |panic| Report::Broken(lease, panic),
+        );
+        None
+    }
+
+    /// Updates the terrain by what the pool has done; says what it means to the session.
+    fn judge(&mut self, report: Report<C>) -> Event {
+        let terrain = &mut self.site.terrain;
+        match report {
+            Report::Absent(hash) => Event::Absent(hash),
+            Report::Spoiled(hash, why) => {
+                terrain.give_up(hash);
+                Event::Spoiled(hash, why)
+            }
+            Report::Index(hash, resident, prepared) => {
+                terrain.add_store(hash, *resident, prepared);
+                Event::Loaded(hash)
+            }
+            Report::Tile(hash, tile) => {
+                let added = terrain.add_tile(hash, &tile);
+                match added.err().or_else(|| terrain.over_limit()) {
+                    None => Event::Loaded(hash),
+                    Some(why) => Event::Spoiled(hash, why),
+                }
+            }
+            Report::Done(done) => Event::Rendered(done),
+            Report::Stopped(lease) => Event::Stopped(lease),
+            Report::Broken(lease, why) => Event::Broken(lease, why),
+            Report::Missing(job, keys) => {
+                let lease = job.lease;
+                let store = self.current.as_ref().map(|(store, _)| *store);
+                let hashes = store.map(|store| terrain.await_tiles(store, &keys));
+                match hashes {
+                    Some(hashes) if !hashes.is_empty() => {
+                        self.paused = Some(job);
+                        Event::Paused(lease, hashes)
+                    }
+                    _ => Event::Broken(lease, "it asks for tiles that no store has".to_owned()),
+                }
+            }
+        }
+    }
+
+    fn stop_current(&mut self) {
+        if let Some((_, stop)) = &self.current {
+            stop.store(true, Ordering::Relaxed);
+        }
+    }
+
+    /// Runs something on the thread pool and reports what came of it, or its panic.
+    fn spawn(
+        &self,
+        run: impl FnOnce() -> Report<C> + Send + 'static,
+        panicked: impl FnOnce(String) -> Report<C> + Send + 'static,
+    ) {
+        let reports = self.reports.clone();
+        self.site.pool.spawn(move || {
+            let report = catch_unwind(AssertUnwindSafe(run));
+            let report = report.unwrap_or_else(|panic| panicked(said(&*panic).to_owned()));
+            // Nobody listens once the connection is lost.
+            let _unheard = reports.blocking_send(report);
+        });
+    }
+}
+
+/// Waits until the outbox has taken a message; for ever if there is none.
+async fn send_waiting(outbox: &Outbox, message: Option<Message>) -> Result<(), LinkError> {
+    match message {
+        Some(message) => outbox.send(message).await,
+        None => std::future::pending().await,
+    }
+}
+
+fn decoded<C: Caster>(caster: &C, hash: BlobHash, bytes: &[u8], is_tile: bool) -> Report<C> {
+    if is_tile {
+        return match codec::decode(bytes) {
+            Ok(tile) => Report::Tile(hash, tile),
+            Err(error) => Report::Spoiled(hash, error.to_string()),
+        };
+    }
+    match decode_index(bytes) {
+        Ok(index) => {
+            let prepared = caster.prepare(&index);
+            Report::Index(hash, Box::new(Resident::new(Arc::new(index))), prepared)
+        }
+        Err(why) => Report::Spoiled(hash, why),
+    }
+}
+
+fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<Done, String> {
+    let pack = if compress { Pixels::compressed } else { Pixels::raw };
+    let pixels = pack(picture.pixels.into()).map_err(|unfit| unfit.to_string())?;
+    let report = RenderReport {
+        cost_us: picture.spent.as_micros() as u64,
+        rays: picture.stats.rays,
+        steps: picture.stats.steps,
+        below_ground: picture.stats.below_ground,
+    };
+    Ok(Done { lease, report, pixels })
+}

@@ -1,0 +1,180 @@
+//! Decoded terrain in memory: stores, their tiles, and a limit.
+//!
+//! Tiles are forgotten in the order in which they were loaded, oldest first, when the
+//! limit is exceeded; the ray caster leaves no trace of what it looks at, and a tile that
+//! was wrongly forgotten comes back from the cache on disk in about a millisecond. Tiles
+//! that the present job has asked for stay until it ends: so a job always gets further.
+
+use crate::render::Scene;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use terrafarm_common::id::BlobHash;
+use terrafarm_terrain::layout::TileKey;
+use terrafarm_terrain::resident::{Resident, Tile};
+
+/// Most stores whose index stays in memory although no shot uses it.
+const IDLE_STORES_MAX: usize = 4;
+
+/// All terrain in memory. `P` is what the ray caster works out for each store.
+pub struct Terrain<P> {
+    stores: BTreeMap<BlobHash, Store<P>>,
+    /// Places that wait for a tile, by its hash. The same tile may lie at many: sea does.
+    awaited: BTreeMap<BlobHash, Vec<Place>>,
+    /// Tiles in memory, oldest first.
+    loaded: VecDeque<Loaded>,
+    /// How many of the newest of them the present job has asked for.
+    pinned: usize,
+    bytes: u64,
+    limit_bytes: u64,
+    /// Stores that no shot uses, oldest first.
+    idle: VecDeque<BlobHash>,
+}
+
+struct Store<P> {
+    resident: Arc<Resident>,
+    prepared: Arc<P>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Place {
+    store: BlobHash,
+    key: TileKey,
+}
+
+#[derive(Debug)]
+struct Loaded {
+    place: Place,
+    bytes: u64,
+}
+
+impl<P> Terrain<P> {
+    /// Nothing yet; decoded tiles may take this many bytes.
+    pub fn new(limit_bytes: u64) -> Self {
+        Terrain {
+            stores: BTreeMap::new(),
+            awaited: BTreeMap::new(),
+            loaded: VecDeque::new(),
+            pinned: 0,
+            bytes: 0,
+            limit_bytes,
+            idle: VecDeque::new(),
+        }
+    }
+
+    /// Bytes that decoded tiles take.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Whether the index of this store is in memory. Marks it as used.
+    pub fn has_store(&mut self, store: BlobHash) -> bool {
+        self.idle.retain(|idle| *idle != store);
+        self.stores.contains_key(&store)
+    }
+
+    /// Takes a store whose index has passed its check.
+    pub fn add_store(&mut self, store: BlobHash, resident: Resident, prepared: P) {
+        let entry = Store { resident: Arc::new(resident), prepared: Arc::new(prepared) };
+        self.stores.insert(store, entry);
+    }
+
+    /// No shot uses a store any more: keeps it for a while, for the next shot.
+    pub fn release(&mut self, store: BlobHash) {
+        if !self.stores.contains_key(&store) || self.idle.contains(&store) {
+            return;
+        }
+        self.idle.push_back(store);
+        if self.idle.len() > IDLE_STORES_MAX {
+            if let Some(oldest) = self.idle.pop_front() {
+                self.stores.remove(&oldest);
+                let gone = |loaded: &Loaded| loaded.place.store == oldest;
+                self.bytes -= self.loaded.iter().filter(|l| gone(l)).map(|l| l.bytes).sum::<u64>();
+                self.loaded.retain(|loaded| !gone(loaded));
+                self.pinned = self.pinned.min(self.loaded.len());
+            }
+        }
+    }
+
+    /// A new job begins: nothing is kept for the one before it.
+    pub fn begin_job(&mut self) {
+        self.pinned = 0;
+        self.trim();
+    }
+
+    /// The terrain as a job sees it now.
+    pub fn scene(&self, store: BlobHash) -> Option<Scene<P>> {
+        let store = self.stores.get(&store)?;
+        Some(Scene { resident: store.resident.clone(), prepared: store.prepared.clone() })
+    }
+
+    /// Notes that a job waits for tiles; their hashes, each once.
+    pub fn await_tiles(&mut self, store: BlobHash, keys: &[TileKey]) -> Vec<BlobHash> {
+        let Some(known) = self.stores.get(&store) else { return Vec::new() };
+        let mut hashes = Vec::new();
+        for &key in keys {
+            let Some(entry) = known.resident.index().entry(key) else { continue };
+            let places = self.awaited.entry(entry.hash).or_default();
+            let place = Place { store, key };
+            if !places.contains(&place) {
+                places.push(place);
+            }
+            hashes.push(entry.hash);
+        }
+        hashes.sort_unstable();
+        hashes.dedup();
+        hashes
+    }
+
+    /// Whether a blob is a tile that a job waits for; if not, it is an index.
+    pub fn is_tile(&self, hash: BlobHash) -> bool {
+        self.awaited.contains_key(&hash)
+    }
+
+    /// Puts a tile wherever it is awaited. Says what is wrong if it does not belong there.
+    pub fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Result<(), String> {
+        let mut bytes = tile.memory_bytes() as u64;
+        for place in self.awaited.remove(&hash).unwrap_or_default() {
+            let Some(store) = self.stores.get_mut(&place.store) else { continue };
+            // No job looks at the tiles now, so nothing is copied here, except after a
+            // lost connection while its last job winds up.
+            if !Arc::make_mut(&mut store.resident).insert(place.key, tile.clone()) {
+                return Err(format!("it is no tile for {:?}", place.key));
+            }
+            self.loaded.push_back(Loaded { place, bytes });
+            self.pinned += 1;
+            // The places share one tile.
+            self.bytes += std::mem::take(&mut bytes);
+        }
+        self.trim();
+        Ok(())
+    }
+
+    /// A tile cannot be had.
+    pub fn give_up(&mut self, hash: BlobHash) {
+        self.awaited.remove(&hash);
+    }
+
+    /// Whether the tiles of the present job alone take more than the limit, in words.
+    pub fn over_limit(&self) -> Option<String> {
+        (self.bytes > self.limit_bytes).then(|| {
+            let megabytes = |bytes: u64| bytes.div_ceil(1 << 20);
+            format!(
+                "the job needs {} MB of decoded terrain, the worker's limit is {} MB; \
+                 raise it, or cut frames into smaller jobs",
+                megabytes(self.bytes),
+                megabytes(self.limit_bytes)
+            )
+        })
+    }
+
+    /// Forgets the oldest tiles that the present job has not asked for.
+    fn trim(&mut self) {
+        while self.bytes > self.limit_bytes && self.loaded.len() > self.pinned {
+            let Some(oldest) = self.loaded.pop_front() else { return };
+            self.bytes -= oldest.bytes;
+            if let Some(store) = self.stores.get_mut(&oldest.place.store) {
+                Arc::make_mut(&mut store.resident).remove(oldest.place.key);
+            }
+        }
+    }
+}
