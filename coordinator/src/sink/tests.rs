@@ -227,6 +227,54 @@ fn built_in_video_is_decoded_whole_and_in_its_colours() {
     }
 }
 
+/// Pictures that encoders stumble over: noise, one colour, hard cuts, jumps by half a
+/// picture, a checkerboard that inverts.
+fn awkward(spec: Spec, frame: u32) -> Rgb8 {
+    let mut state = u64::from(frame / 20) * 7919 + 1;
+    let mut noise = || {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    let pixel = |i: u32| {
+        let (x, y) = (i % spec.width, i / spec.width);
+        let moved = (x + frame * spec.width / 2) % spec.width;
+        let noise = noise();
+        match (frame / 5) % 5 {
+            0 => [noise; 3],
+            1 => [255, 0, (frame * 50 % 256) as u8],
+            2 => [(x * 9 + frame * 90) as u8, (y * 3) as u8, 40],
+            3 => [(moved * 4) as u8, (y * 4) as u8, noise / 4],
+            _ => [if (x / 8 + y / 8 + frame) % 2 == 0 { 255 } else { 0 }; 3],
+        }
+    };
+    let pixels = (0..spec.width * spec.height).flat_map(pixel).collect();
+    Rgb8::from_pixels(spec.width, spec.height, pixels).unwrap()
+}
+
+#[test]
+fn awkward_pictures_do_not_drift_apart_from_what_a_decoder_sees() {
+    let folder = tempfile::tempdir().unwrap();
+    for (width, height) in [(176, 144), (98, 50), (17, 33)] {
+        let spec = spec(width, height, 60);
+        let output = folder.path().join(format!("{width}.mp4"));
+        let mut sink = open(&output, spec, Encoder::BuiltIn).unwrap();
+        (0..spec.frames).for_each(|n| sink.put(n, &awkward(spec, n)).unwrap());
+        sink.finish().unwrap();
+        let path = output.to_str().unwrap();
+        let arguments = ["-v", "warning", "-i", path, "-f", "rawvideo", "-"];
+        let Some(seen) = ask("ffmpeg", &arguments) else { return };
+        let (wide, high) = (colour::even(width as usize), colour::even(height as usize));
+        let frames: Vec<_> = seen.chunks(wide * high * 3 / 2).collect();
+        assert_eq!(frames.len(), 60);
+        for (n, frame) in frames.into_iter().enumerate() {
+            let luma = colour::halved(&awkward(spec, n as u32)).y;
+            let (_, mean) = differences(&frame[..wide * high], &luma);
+            assert!(mean < 5.0, "{width} x {height}, frame {n}: {mean} levels");
+        }
+    }
+}
+
 #[test]
 fn built_in_video_starts_with_its_index() {
     let folder = tempfile::tempdir().unwrap();
