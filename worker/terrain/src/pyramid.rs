@@ -269,8 +269,12 @@ impl<P: Post> FinePosts<P> {
         tile
     }
 
-    /// The largest distance between a coarse tile's surface and this level's.
+    /// The largest distance between a coarse tile's surface and this level's; 0 for
+    /// photos.
     pub(crate) fn deviation(&self, tx: u32, ty: u32, tile: &[P]) -> f64 {
+        if P::KIND == LayerKind::Photo {
+            return 0.0;
+        }
         let mut deviation: f64 = 0.0;
         for j in 0..TILE_CELLS {
             for i in 0..TILE_CELLS {
@@ -279,9 +283,6 @@ impl<P: Post> FinePosts<P> {
                     [tile[at], tile[at + 1], tile[at + TILE_POSTS], tile[at + TILE_POSTS + 1]];
                 let west = 2 * (u64::from(tx) * TILE_CELLS as u64 + i as u64);
                 let south = 2 * (u64::from(ty) * TILE_CELLS as u64 + j as u64);
-                if west >= self.grid[0] || south >= self.grid[1] {
-                    continue;
-                }
                 let fine = [0, 1, 2].map(|row| {
                     [0, 1, 2].map(|column| {
                         let place = [west + column, south + row];
