@@ -47,7 +47,7 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
             .then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
-        reconnect: if args.once { Reconnect::Never } else { Reconnect::Forever },
+        reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
         seed: process_seed(),
     };
     runtime()?.block_on(async {

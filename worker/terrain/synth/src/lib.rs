@@ -19,6 +19,9 @@ mod noise;
 mod photo;
 mod surface;
 mod valley;
+mod write;
+
+pub use write::{WriteError, write_store};
 
 use landscape::Landscape;
 use rayon::prelude::*;
