@@ -7,7 +7,7 @@
 
 use crate::blocks::{check_window, wrong_content};
 use crate::info::{Content, GeoTransform, Raster, RasterError, RasterInfo, Vertical, Window};
-use crate::limits::{MAX_WHOLE_FILE_BYTES, MAX_ZIP_ENTRIES};
+use crate::limits::MAX_ZIP_ENTRIES;
 use crate::options::{HeightUnit, OpenOptions};
 use crate::source::{Sidecars, Source};
 use std::io::{Cursor, Read};
@@ -17,6 +17,8 @@ use std::path::Path;
 const SIDES: [u64; 2] = [1201, 3601];
 /// Length of the largest tile, bytes.
 const MAX_TILE_BYTES: u64 = 2 * SIDES[1] * SIDES[1];
+/// Length of the longest archive: a tile that did not become shorter, and a readme.
+const MAX_ZIP_BYTES: u64 = MAX_TILE_BYTES + (1 << 20);
 
 struct Hgt {
     source: Source,
@@ -75,8 +77,7 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
 pub fn open_zip(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, RasterError> {
     let path = source.path().to_owned();
     let damaged = |what: String| RasterError::damaged(&path, what);
-    // Nothing in the archive may be much longer than what it unpacks to.
-    let bytes = source.whole(MAX_WHOLE_FILE_BYTES.min(4 * MAX_TILE_BYTES))?;
+    let bytes = source.whole(MAX_ZIP_BYTES)?;
     let mut archive = zip::ZipArchive::new(Cursor::new(bytes))
         .map_err(|error| damaged(format!("the zip archive cannot be read: {error}")))?;
     let tile = (0..archive.len().min(MAX_ZIP_ENTRIES)).find_map(|index| {

@@ -70,7 +70,7 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
     let (header, start) = record_a(path, &bytes)?;
     let metres = options.unit.unwrap_or(header.unit).metres();
     let profiles = read_profiles(path, &bytes, start, &header, metres)?;
-    let (size, first, heights) = fill_grid(path, &header, &profiles)?;
+    let Grid { size, first, heights } = fill_grid(path, &header, &profiles)?;
     let step = [0, 1].map(|axis| header.spacing[axis] * header.ground);
     let [width, height] = size;
     let top = first[1] * header.ground + (height - 1) as f64 * step[1];
@@ -255,13 +255,17 @@ fn read_profiles(
     Ok(profiles)
 }
 
-/// Lays the profiles out on a grid, row 0 in the north. Gives its size, the position of
-/// its south-west post, and its heights.
-fn fill_grid(
-    path: &Path,
-    header: &RecordA,
-    profiles: &[Profile],
-) -> Result<([u64; 2], [f64; 2], Vec<f32>), RasterError> {
+/// Profiles laid out on a grid.
+struct Grid {
+    size: [u64; 2],
+    /// Position of the south-west post.
+    first: [f64; 2],
+    /// Row by row from the north.
+    heights: Vec<f32>,
+}
+
+/// Lays the profiles out on a grid.
+fn fill_grid(path: &Path, header: &RecordA, profiles: &[Profile]) -> Result<Grid, RasterError> {
     let damaged = |what: &str| RasterError::damaged(path, what);
     let filled: Vec<&Profile> = profiles.iter().filter(|p| !p.heights.is_empty()).collect();
     let least = |axis: usize| filled.iter().map(|p| p.start[axis]).fold(f64::INFINITY, f64::min);
@@ -293,7 +297,7 @@ fn fill_grid(
             heights[(height - 1 - row - k) * width + column] = value;
         }
     }
-    Ok(([width as u64, height as u64], first, heights))
+    Ok(Grid { size: [width as u64, height as u64], first, heights })
 }
 
 #[cfg(test)]

@@ -73,8 +73,10 @@ impl GeoKeys {
 
     /// Whether positions are longitudes and latitudes.
     pub fn is_geographic(&self) -> bool {
-        self.code(1024) == Some(2)
-            || self.code(1024).is_none() && self.code(3072).is_none() && self.code(2048).is_some()
+        match self.code(1024) {
+            Some(model) => model == 2,
+            None => self.code(3072).is_none() && self.code(2048).is_some(),
+        }
     }
 
     /// What heights are measured from. Every vertical system of the EPSG register is

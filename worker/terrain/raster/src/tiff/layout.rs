@@ -6,6 +6,9 @@ use crate::source::{Source, conversion_hint};
 use crate::tiff::codec::{Compression, decompress, to_native};
 use crate::tiff::directory::{Directory, Order};
 
+/// The largest number of samples per pixel.
+const MAX_BANDS: u64 = 4096;
+
 /// What one sample is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SampleKind {
@@ -122,34 +125,22 @@ impl Layout {
         let number = |tag: u16| directory.number(source, tag);
         let required = |tag: u16, name: &str| {
             number(tag)?.filter(|&value| value > 0).ok_or_else(|| {
-                RasterError::damaged(
-                    path,
-                    format!("the directory has no usable {name} (tag {tag})"),
-                )
+                let what = format!("the directory has no usable {name} (tag {tag})");
+                RasterError::damaged(path, what)
             })
         };
         let size = [required(256, "width")?, required(257, "height")?];
-        if size.iter().any(|&side| side > MAX_SIDE) {
+        let bands = number(277)?.unwrap_or(1);
+        if size.iter().any(|&side| side > MAX_SIDE) || !(1..=MAX_BANDS).contains(&bands) {
             let what = format!(
-                "{} x {} samples are declared; at most {MAX_SIDE} along a side are read",
+                "{} x {} samples of {bands} bands are declared; at most {MAX_SIDE} along a side \
+                 and {MAX_BANDS} bands are read",
                 size[0], size[1]
             );
             return Err(RasterError::damaged(path, what));
         }
-        let bands = number(277)?.unwrap_or(1);
-        if !(1..=4096).contains(&bands) {
-            return Err(RasterError::damaged(path, format!("{bands} bands are declared")));
-        }
         let compression = compression(source, number(259)?.unwrap_or(1))?;
-        let predictor = number(317)?.unwrap_or(1);
         let kind = sample_kind(source, directory)?;
-        if !(predictor == 1
-            || predictor == 2
-            || predictor == 3 && matches!(kind, SampleKind::F32 | SampleKind::F64))
-        {
-            let what = format!("predictor {predictor} is not defined for {}", kind.name());
-            return Err(RasterError::damaged(path, what));
-        }
         let separate = bands > 1 && number(284)?.unwrap_or(1) == 2;
         let tiled = number(322)?.is_some();
         let chunk = if tiled {
@@ -158,45 +149,13 @@ impl Layout {
             [size[0], number(278)?.unwrap_or(size[1]).clamp(1, size[1])]
         };
         let per_pixel = if separate { 1 } else { bands } * kind.bytes() as u64;
-        let chunk_bytes = chunk[0].checked_mul(chunk[1]).and_then(|n| n.checked_mul(per_pixel));
-        if !chunk_bytes.is_some_and(|bytes| bytes <= MAX_CHUNK_BYTES) {
-            let what = format!(
-                "a strip or tile of {} x {} pixels is too large to be held in memory (limit \
-                 {MAX_CHUNK_BYTES} bytes); {}",
-                chunk[0],
-                chunk[1],
-                conversion_hint(path)
-            );
-            return Err(RasterError::unsupported(path, what));
-        }
-        let (across, down) = (size[0].div_ceil(chunk[0]), size[1].div_ceil(chunk[1]));
-        let planes = if separate { bands } else { 1 };
-        let chunks = (across * down).saturating_mul(planes);
+        let [across, down] = count_chunks(source, size, chunk, per_pixel)?;
+        let chunks = (across * down).saturating_mul(if separate { bands } else { 1 });
         let tags = if tiled { (324, 325) } else { (273, 279) };
-        if chunks > MAX_CHUNKS {
-            let what = format!(
-                "{chunks} strips or tiles; at most {MAX_CHUNKS} are read; {}",
-                conversion_hint(path)
-            );
-            return Err(RasterError::unsupported(path, what));
-        }
-        let table = |tag: u16| {
-            let values = directory.numbers(source, tag, MAX_CHUNKS)?.unwrap_or_default();
-            if (values.len() as u64) < chunks {
-                let what = format!(
-                    "tag {tag} lists {} strips or tiles, {} x {} samples need {chunks}; the file \
-                     is damaged",
-                    values.len(),
-                    size[0],
-                    size[1]
-                );
-                return Err(RasterError::damaged(path, what));
-            }
-            Ok(values)
-        };
         Ok(Layout {
-            offsets: table(tags.0)?,
-            lengths: table(tags.1)?,
+            offsets: chunk_table(source, directory, tags.0, chunks)?,
+            lengths: chunk_table(source, directory, tags.1, chunks)?,
+            predictor: predictor(source, number(317)?.unwrap_or(1), compression, kind)?,
             photometric: number(262)?.unwrap_or(1),
             order: directory.order,
             bands: bands as usize,
@@ -206,7 +165,6 @@ impl Layout {
             chunk,
             tiled,
             compression,
-            predictor,
             across,
             down,
         })
@@ -283,6 +241,71 @@ impl Layout {
         };
         let tiled = if self.tiled { "tiled" } else { "strips" };
         format!("{}, {compression}, {tiled}", self.kind.name())
+    }
+}
+
+/// How many strips or tiles lie beside and below each other, if one of them fits in memory.
+fn count_chunks(
+    source: &Source,
+    size: [u64; 2],
+    chunk: [u64; 2],
+    per_pixel: u64,
+) -> Result<[u64; 2], RasterError> {
+    let bytes = chunk[0].checked_mul(chunk[1]).and_then(|pixels| pixels.checked_mul(per_pixel));
+    if bytes.is_none_or(|bytes| bytes > MAX_CHUNK_BYTES) {
+        let what = format!(
+            "a strip or tile of {} x {} pixels is too large to be held in memory (limit \
+             {MAX_CHUNK_BYTES} bytes); {}",
+            chunk[0],
+            chunk[1],
+            conversion_hint(source.path())
+        );
+        return Err(RasterError::unsupported(source.path(), what));
+    }
+    Ok([size[0].div_ceil(chunk[0]), size[1].div_ceil(chunk[1])])
+}
+
+/// The positions or lengths of all strips or tiles.
+fn chunk_table(
+    source: &Source,
+    directory: &Directory,
+    tag: u16,
+    chunks: u64,
+) -> Result<Vec<u64>, RasterError> {
+    if chunks > MAX_CHUNKS {
+        let what = format!(
+            "{chunks} strips or tiles are declared; at most {MAX_CHUNKS} are read; {}",
+            conversion_hint(source.path())
+        );
+        return Err(RasterError::unsupported(source.path(), what));
+    }
+    let values = directory.numbers(source, tag, MAX_CHUNKS)?.unwrap_or_default();
+    if (values.len() as u64) < chunks {
+        let what = format!(
+            "tag {tag} lists {} strips or tiles, the declared size needs {chunks}; the file is \
+             damaged",
+            values.len()
+        );
+        return Err(RasterError::damaged(source.path(), what));
+    }
+    Ok(values)
+}
+
+/// The predictor, which only the dictionary compressions have.
+fn predictor(
+    source: &Source,
+    tag: u64,
+    compression: Compression,
+    kind: SampleKind,
+) -> Result<u64, RasterError> {
+    match (tag, compression) {
+        (_, Compression::None | Compression::PackBits) => Ok(1),
+        (1 | 2, _) => Ok(tag),
+        (3, _) if !kind.is_whole() => Ok(tag),
+        _ => {
+            let what = format!("predictor {tag} is not defined for {}", kind.name());
+            Err(RasterError::damaged(source.path(), what))
+        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! GeoTIFF: heights and photos, read strip by strip or tile by tile.
 //!
-//! Directory and tags are in [`directory`], storage and decoding in [`layout`] and
-//! [`codec`], reference systems in [`geokeys`]. Here: which picture of the file is read,
-//! where it lies, and the two rasters, [`heights`] and [`photo`].
+//! Directory and tags are in `directory`, storage and decoding in `layout` and
+//! `codec`, reference systems in `geokeys`. Here: which picture of the file is read,
+//! where it lies, and the two rasters, `heights` and `photo`.
 
 mod codec;
 mod directory;

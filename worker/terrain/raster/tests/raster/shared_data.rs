@@ -67,8 +67,8 @@ fn the_places_of_real_files_are_those_of_gdal() {
         ),
         (
             "helens/SainteHelens.dem",
-            [327, 468],
-            [557_820.0, 5_121_990.0],
+            [327, 466],
+            [557_820.0, 5_121_960.0],
             "EPSG:26710",
             Vertical::Unknown,
         ),
