@@ -10,6 +10,10 @@
 //! posts; `sample` interpolates; `surface` and `photo` give the posts of a layer on
 //! demand; `measure` compares; `run` does all of it in order.
 //!
+//! Reprojected terrain ends where the outermost samples lie, less a part of a cell: a
+//! surface is never continued beyond its samples. What a raster claims to cover beyond
+//! the centres of its outermost samples is lost likewise.
+//!
 //! Nothing is held whole. The builder of the store asks for the posts of a tile; a tile
 //! asks its inputs for the samples it needs; inputs keep a bounded cache.
 

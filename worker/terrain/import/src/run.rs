@@ -103,13 +103,16 @@ fn build(
         return Err(ImportError::AllVoid { inputs: names(&base.mosaics) });
     }
 
+    let mut void_posts = watched.void.load(Ordering::Relaxed);
     let mut layers = vec![surface.clone()];
     let mut stacks = vec![base.clone()];
     for (number, PlannedLayer { grid, mosaics }) in insets.into_iter().enumerate() {
         let own = Arc::new(Stack { grid, mosaics });
         let inset = Inset { own: own.clone(), below: layers.clone() };
         let stage = stage(progress, Stage::Inset(number + 1));
-        builder.add_layer(height_spec(&grid, None), &Watched::new(&inset, None), &stage, cancel)?;
+        let source = Watched::new(&inset, None);
+        builder.add_layer(height_spec(&grid, None), &source, &stage, cancel)?;
+        void_posts += source.void.load(Ordering::Relaxed);
         layers.push(Arc::new(inset));
         stacks.push(own);
     }
@@ -144,7 +147,7 @@ fn build(
         warnings,
         max_resampling_error_m: errors.max_m,
         rms_resampling_error_m: errors.rms_m(),
-        void_posts: 0,
+        void_posts,
         made_by: concat!("terrafarm ", env!("CARGO_PKG_VERSION")).into(),
     };
     let store = builder.finish(report.clone())?;

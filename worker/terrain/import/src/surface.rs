@@ -332,40 +332,54 @@ pub(crate) fn surface_at(
     Ok(found)
 }
 
-/// Heights as the store's builder asks for them; watches for anything valid and for
-/// posts that were filled.
+/// Heights as the store's builder asks for them, a tile at a time; watches for anything
+/// valid, for voids, and for posts that were filled.
 pub(crate) struct Watched<'a> {
     pub(crate) heights: &'a dyn Heights,
     /// The same before voids were filled.
     pub(crate) unfilled: Option<&'a dyn Heights>,
     pub(crate) any_valid: AtomicBool,
     pub(crate) filled: AtomicU64,
+    pub(crate) void: AtomicU64,
 }
 
 impl<'a> Watched<'a> {
     pub(crate) fn new(heights: &'a dyn Heights, unfilled: Option<&'a dyn Heights>) -> Self {
-        Watched { heights, unfilled, any_valid: AtomicBool::new(false), filled: AtomicU64::new(0) }
+        Watched {
+            heights,
+            unfilled,
+            any_valid: AtomicBool::new(false),
+            filled: AtomicU64::new(0),
+            void: AtomicU64::new(0),
+        }
     }
 
-    /// Number of posts of a tile's window that were void before; those that two tiles
-    /// share count for one.
-    fn count_filled(&self, window: PostWindow, heights: &[f32]) -> Result<u64, ImportError> {
-        let Some(unfilled) = self.unfilled else { return Ok(0) };
-        let before = unfilled.heights(window)?;
+    /// Counts void and filled posts of a tile's window; those that two tiles share count
+    /// for one.
+    fn count(&self, window: PostWindow, heights: &[f32]) -> Result<(), ImportError> {
         let side = TILE_CELLS as i64;
         let posts = self.heights.grid().posts.map(|n| n as i64);
-        let owned = |post: i64, first: i64, axis: usize| {
+        let owned = |first: i64, axis: usize| {
             let start = (first + 1) / side * side;
-            let end = if start + side >= posts[axis] - 1 { posts[axis] } else { start + side };
-            (start..end).contains(&post)
+            let last = start + side >= posts[axis] - 1;
+            start..if last { posts[axis] } else { start + side }
         };
-        let count = before.iter().zip(heights).enumerate().filter(|(n, (before, now))| {
-            let (i, j) =
-                (window.i + (n % window.width) as i64, window.j + (n / window.width) as i64);
-            let filled = before.is_nan() && !now.is_nan();
-            filled && owned(i, window.i, 0) && owned(j, window.j, 1)
-        });
-        Ok(count.count() as u64)
+        let (columns, rows) = (owned(window.i, 0), owned(window.j, 1));
+        let is_owned = |n: usize| {
+            let (i, j) = (n % window.width, n / window.width);
+            columns.contains(&(window.i + i as i64)) && rows.contains(&(window.j + j as i64))
+        };
+        let voids = |heights: &[f32]| {
+            let voids = heights.iter().enumerate().filter(|(n, h)| h.is_nan() && is_owned(*n));
+            voids.count() as u64
+        };
+        let void = voids(heights);
+        self.void.fetch_add(void, Ordering::Relaxed);
+        if let Some(unfilled) = self.unfilled {
+            let before = voids(&unfilled.heights(window)?);
+            self.filled.fetch_add(before - void, Ordering::Relaxed);
+        }
+        Ok(())
     }
 }
 
@@ -382,9 +396,8 @@ impl LayerSource for Watched<'_> {
         let heights = self.heights.heights(window).map_err(Box::new)?;
         if heights.iter().any(|height| !height.is_nan()) {
             self.any_valid.store(true, Ordering::Relaxed);
-            let filled = self.count_filled(window, &heights).map_err(Box::new)?;
-            self.filled.fetch_add(filled, Ordering::Relaxed);
         }
+        self.count(window, &heights).map_err(Box::new)?;
         into.copy_from_slice(&heights);
         Ok(())
     }
