@@ -167,7 +167,7 @@ fn a_full_disk_is_named_as_such() {
 }
 
 #[test]
-fn raw_video_keeps_its_colours_to_two_levels() {
+fn raw_video_keeps_its_colours_to_three_levels() {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("a.y4m");
     let spec = spec(101, 57, 3);
