@@ -3,10 +3,10 @@
 //! A [`Flight`] passes through every keyframe at its time. Between them
 //!
 //! - the horizontal position is a C1 cubic whose tangents are those of the C2 spline,
-//!   limited so that it neither loops nor backs up at a sharp turn ([`spline`]);
+//!   limited so that it neither loops nor backs up at a sharp turn (`spline`);
 //! - the height and the field of view are such cubics of their own, monotone between
 //!   two keyframes: the camera never dips below the lower of its neighbours;
-//! - the attitude turns the short way by a C1 curve of quaternions ([`turn`]), so that
+//! - the attitude turns the short way by a C1 curve of quaternions (`turn`), so that
 //!   pitch +-90 degrees is an attitude like any other. Between keyframes that differ in
 //!   heading *and* pitch the horizon may tilt a little, as it does on any shortest turn.
 //!

@@ -47,7 +47,7 @@ impl Turn {
 }
 
 /// The rotation vector in camera axes, radians, that leads from one attitude to another
-/// by at most 180 degrees. At exactly 180 the way is chosen: see [`super`].
+/// by at most 180 degrees. At exactly 180 the way is chosen: see the module above.
 pub(super) fn short_way(from: DQuat, to: DQuat) -> DVec3 {
     let between = from.conjugate() * to;
     let short = if between.w < 0.0 { -between } else { between };

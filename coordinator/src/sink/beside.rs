@@ -1,10 +1,14 @@
 //! A file that appears whole or not at all.
 
 use super::SinkError;
+use std::ffi::OsString;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::io::{self, BufWriter, ErrorKind, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Names that are tried before giving up.
+const MAX_ATTEMPTS: u32 = 1000;
 
 /// Written under a hidden name in the same folder; [`Beside::commit`] syncs it and moves
 /// it into place, over what may be there. Dropped before that, it is removed.
@@ -18,16 +22,14 @@ pub(super) struct Beside {
 impl Beside {
     /// Opens the file, and makes the folders that lead to it.
     pub fn create(target: &Path) -> Result<Self, SinkError> {
-        let temporary = reserve(target)?;
-        let file = File::create_new(&temporary)
-            .map_err(|error| SinkError::io("create", &temporary, error))?;
+        let (temporary, file) = reserve(target)?;
         let file = Some(BufWriter::with_capacity(1 << 20, file));
         Ok(Beside { target: target.to_path_buf(), temporary, file })
     }
 
     /// A place for another program to write to.
     pub fn for_program(target: &Path) -> Result<Self, SinkError> {
-        let temporary = reserve(target)?;
+        let (temporary, _) = reserve(target)?;
         Ok(Beside { target: target.to_path_buf(), temporary, file: None })
     }
 
@@ -91,19 +93,28 @@ impl Drop for Beside {
     }
 }
 
-/// A free name in the folder of the target. Two programs may write the same output.
-fn reserve(target: &Path) -> Result<PathBuf, SinkError> {
+/// A new file in the folder of the target. Its name may be taken by what a killed program
+/// of the same number left, or one on another machine writes; then the next is tried.
+fn reserve(target: &Path) -> Result<(PathBuf, File), SinkError> {
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let Some(name) = target.file_name() else {
         return Err(SinkError::output(target, "it names no file"));
     };
     let folder = folder_of(target);
     fs::create_dir_all(folder).map_err(|error| SinkError::io("make the folder", folder, error))?;
-    let count = COUNT.fetch_add(1, Ordering::Relaxed);
-    let mut hidden = std::ffi::OsString::from(format!(".{}-{count}.partial.", std::process::id()));
-    // The ending stays last: ffmpeg chooses the container by it.
-    hidden.push(name);
-    Ok(folder.join(hidden))
+    for _ in 0..MAX_ATTEMPTS {
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let mut hidden = OsString::from(format!(".{}-{count}.partial.", std::process::id()));
+        // The ending stays last: ffmpeg chooses the container by it.
+        hidden.push(name);
+        let temporary = folder.join(hidden);
+        match File::create_new(&temporary) {
+            Ok(file) => return Ok((temporary, file)),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(SinkError::io("create", &temporary, error)),
+        }
+    }
+    Err(SinkError::output(target, "its folder has no name left"))
 }
 
 fn folder_of(target: &Path) -> &Path {
@@ -118,5 +129,28 @@ fn folder_of(target: &Path) -> &Path {
 fn sync_folder(target: &Path) {
     if cfg!(unix) {
         let _ = File::open(folder_of(target)).and_then(|folder| folder.sync_all());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_killed_program_left_is_not_in_the_way() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let target = folder.path().join("film.y4m");
+        let first = Beside::create(&target).expect("a file");
+        let name = first.temporary().file_name().and_then(|n| n.to_str()).expect("a name");
+        let count: u64 = name.split(['-', '.']).nth(2).and_then(|n| n.parse().ok()).expect("n");
+        for next in count + 1..count + 200 {
+            let left = format!(".{}-{next}.partial.film.y4m", std::process::id());
+            fs::write(folder.path().join(left), b"").expect("a leftover");
+        }
+        let mut second = Beside::create(&target).expect("another name");
+        second.write(b"whole").expect("room");
+        second.overwrite(0, b"W").expect("room");
+        assert_eq!(second.commit().expect("a name"), 5);
+        assert_eq!(fs::read(&target).expect("the file"), b"Whole");
     }
 }

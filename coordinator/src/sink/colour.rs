@@ -24,27 +24,26 @@ pub(super) struct Planes {
     pub cr: Vec<u8>,
 }
 
-fn weigh(row: [i32; 3], rgb: [i32; 3], offset: i32, shift: u32) -> u8 {
-    let sum: i32 = row.iter().zip(rgb).map(|(factor, value)| factor * value).sum();
-    let rounded = (sum + (HALF << shift)) >> (BITS + shift);
-    (rounded + offset).clamp(0, 255) as u8
+/// Weighs the sum of `1 << shift` pixels. The rows of the matrix keep every result within
+/// 16 to 240, so nothing is clamped.
+#[inline(always)]
+fn weigh(row: [i32; 3], [r, g, b]: [i32; 3], offset: i32, shift: u32) -> u8 {
+    let sum = row[0] * r + row[1] * g + row[2] * b;
+    ((sum + (offset << (BITS + shift)) + (HALF << shift)) >> (BITS + shift)) as u8
+}
+
+#[inline(always)]
+fn rgb(pixel: &[u8]) -> [i32; 3] {
+    [i32::from(pixel[0]), i32::from(pixel[1]), i32::from(pixel[2])]
 }
 
 /// One chroma sample a pixel.
 pub(super) fn full(picture: &Rgb8) -> Planes {
-    let count = picture.pixels().len() / 3;
-    let mut planes = Planes {
-        y: Vec::with_capacity(count),
-        cb: Vec::with_capacity(count),
-        cr: Vec::with_capacity(count),
+    let plane = |row, offset| {
+        let pixels = picture.pixels().chunks_exact(3);
+        pixels.map(|pixel| weigh(row, rgb(pixel), offset, 0)).collect()
     };
-    for pixel in picture.pixels().chunks_exact(3) {
-        let rgb = [pixel[0], pixel[1], pixel[2]].map(i32::from);
-        planes.y.push(weigh(LUMA, rgb, 16, 0));
-        planes.cb.push(weigh(BLUE, rgb, 128, 0));
-        planes.cr.push(weigh(RED, rgb, 128, 0));
-    }
-    planes
+    Planes { y: plane(LUMA, 16), cb: plane(BLUE, 128), cr: plane(RED, 128) }
 }
 
 /// One chroma sample for 2 x 2 pixels, in their middle. An odd last column or row is
@@ -52,29 +51,30 @@ pub(super) fn full(picture: &Rgb8) -> Planes {
 pub(super) fn halved(picture: &Rgb8) -> Planes {
     let (width, height) = (picture.width() as usize, picture.height() as usize);
     let (wide, high) = (even(width), even(height));
-    let mut planes = Planes {
-        y: vec![0; wide * high],
-        cb: Vec::with_capacity(wide * high / 4),
-        cr: Vec::with_capacity(wide * high / 4),
-    };
-    let row = |y: usize| &picture.pixels()[y.min(height - 1) * width * 3..][..width * 3];
-    for (pair, luma) in planes.y.chunks_exact_mut(2 * wide).enumerate() {
-        let rows = [row(2 * pair), row(2 * pair + 1)];
-        let (upper, lower) = luma.split_at_mut(wide);
-        for x in (0..wide).step_by(2) {
-            let mut sum = [0; 3];
-            for (source, out) in rows.iter().zip([&mut *upper, &mut *lower]) {
-                for column in [x, x + 1] {
-                    let at = column.min(width - 1) * 3;
-                    let rgb = [source[at], source[at + 1], source[at + 2]].map(i32::from);
-                    out[column] = weigh(LUMA, rgb, 16, 0);
-                    for (total, value) in sum.iter_mut().zip(rgb) {
-                        *total += value;
-                    }
-                }
+    let quarter = wide * high / 4;
+    let mut planes = Planes { y: vec![0; wide * high], cb: vec![0; quarter], cr: vec![0; quarter] };
+    let mut rows = [vec![0; wide * 3], vec![0; wide * 3]];
+    let chroma = planes.cb.chunks_exact_mut(wide / 2).zip(planes.cr.chunks_exact_mut(wide / 2));
+    for (pair, (luma, (cb, cr))) in planes.y.chunks_exact_mut(2 * wide).zip(chroma).enumerate() {
+        for (i, row) in rows.iter_mut().enumerate() {
+            let y = (2 * pair + i).min(height - 1);
+            row[..width * 3].copy_from_slice(&picture.pixels()[y * width * 3..][..width * 3]);
+            row.copy_within((width - 1) * 3..width * 3, (wide - 1) * 3);
+        }
+        let [upper, lower] = &rows;
+        for (out, row) in luma.chunks_exact_mut(wide).zip([upper, lower]) {
+            for (out, pixel) in out.iter_mut().zip(row.chunks_exact(3)) {
+                *out = weigh(LUMA, rgb(pixel), 16, 0);
             }
-            planes.cb.push(weigh(BLUE, sum, 128, 2));
-            planes.cr.push(weigh(RED, sum, 128, 2));
+        }
+        let blocks = upper.chunks_exact(6).zip(lower.chunks_exact(6));
+        for ((cb, cr), (a, b)) in cb.iter_mut().zip(cr).zip(blocks) {
+            let sum = |channel: usize| {
+                [a[channel], a[channel + 3], b[channel], b[channel + 3]].map(i32::from).iter().sum()
+            };
+            let sums = [sum(0), sum(1), sum(2)];
+            *cb = weigh(BLUE, sums, 128, 2);
+            *cr = weigh(RED, sums, 128, 2);
         }
     }
     planes

@@ -94,12 +94,13 @@ impl FrameSink for Ffmpeg {
     }
 
     fn finish(mut self: Box<Self>) -> Result<Finished, SinkError> {
+        let path = self.file.as_ref().map(|file| file.target().to_path_buf());
+        let output = path.unwrap_or_default();
+        self.arrivals.all_here(&output)?;
+        self.end()?;
         let Some(file) = self.file.take() else {
             return Err(failed("it is finished already".to_string()));
         };
-        let output = file.target().to_path_buf();
-        self.arrivals.all_here(&output)?;
-        self.end()?;
         let bytes = file.commit()?;
         Ok(Finished { output, frames: self.arrivals.next, bytes })
     }

@@ -178,7 +178,9 @@ pub fn open(output: &Path, spec: Spec, encoder: Encoder) -> Result<Box<dyn Frame
         )),
         (Some(other), _) => Err(SinkError::output(
             output,
-            format!("\".{other}\" is no known ending; use a folder, name_%05d.png, .y4m or .mp4"),
+            format!(
+                "\".{other}\" is no known ending; use name_%05d.png, .y4m or .mp4, or end the name of a folder with \"/\""
+            ),
         )),
     }
 }

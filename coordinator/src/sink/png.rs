@@ -74,10 +74,11 @@ enum Names {
 
 impl Names {
     fn of(output: &Path, frames: u32) -> Result<Self, SinkError> {
-        if output.is_dir() || ends_with_separator(output) || output.extension().is_none() {
+        let name = output.file_name().and_then(|name| name.to_str());
+        let is_plain = output.extension().is_none() && !name.is_some_and(|n| n.contains('%'));
+        if output.is_dir() || ends_with_separator(output) || is_plain {
             return Self::numbered(output.to_path_buf(), IN_A_FOLDER, output);
         }
-        let name = output.file_name().and_then(|name| name.to_str());
         let name = name.ok_or_else(|| SinkError::output(output, "its name is not Unicode"))?;
         if name.contains('%') {
             let folder = output.parent().unwrap_or(Path::new("")).to_path_buf();
@@ -120,6 +121,9 @@ impl Names {
         }
         texts[usize::from(digits.is_some())].push_str(rest);
         let Some(digits) = digits else { return wrong("its pattern has no number") };
+        if !pattern.to_lowercase().ends_with(".png") {
+            return wrong("its pattern does not end with .png");
+        }
         let [before, after] = texts;
         Ok(Names::Numbered { folder, before, digits, after })
     }
@@ -160,7 +164,9 @@ mod tests {
 
     #[test]
     fn wrong_patterns_say_what_to_write() {
-        for pattern in ["a%x.png", "a%.png", "a%99d.png", "a%d_%d.png", "a%%.png", "a%-3d.png"] {
+        for pattern in
+            ["a%x.png", "a%.png", "a_%05d", "a%99d.png", "a%d_%d.png", "a%%.png", "a%-3d.png"]
+        {
             assert!(name_of(pattern, 0).is_err_and(|e| e.contains("name_%05d.png")), "{pattern}");
         }
         assert!(name_of("film.png", 0).is_err_and(|e| e.contains("film_%05d.png")));

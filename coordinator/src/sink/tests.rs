@@ -167,7 +167,7 @@ fn a_full_disk_is_named_as_such() {
 }
 
 #[test]
-fn raw_video_keeps_its_colours_to_two_levels() {
+fn raw_video_keeps_its_colours_to_three_levels() {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("a.y4m");
     let spec = spec(101, 57, 3);
@@ -245,7 +245,7 @@ fn awkward(spec: Spec, frame: u32) -> Rgb8 {
             1 => [255, 0, (frame * 50 % 256) as u8],
             2 => [(x * 9 + frame * 90) as u8, (y * 3) as u8, 40],
             3 => [(moved * 4) as u8, (y * 4) as u8, noise / 4],
-            _ => [if (x / 8 + y / 8 + frame) % 2 == 0 { 255 } else { 0 }; 3],
+            _ => [if (x / 8 + y / 8 + frame).is_multiple_of(2) { 255 } else { 0 }; 3],
         }
     };
     let pixels = (0..spec.width * spec.height).flat_map(pixel).collect();
