@@ -53,7 +53,7 @@ enum Report<C: Caster> {
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
     Done(Done),
-    Missing(Job<C>, Vec<TileKey>),
+    Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
     Broken(LeaseId, String),
 }
@@ -66,7 +66,7 @@ pub(crate) struct Shift<'a, C: Caster> {
     silence: Duration,
     /// The store of the job that is begun, and how to stop it.
     current: Option<(BlobHash, Arc<AtomicBool>)>,
-    paused: Option<Job<C>>,
+    paused: Option<Box<Job<C>>>,
     /// What the outbox had no room for, in order.
     backlog: VecDeque<Message>,
     ended: bool,
@@ -251,7 +251,7 @@ impl<'a, C: Caster> Shift<'a, C> {
         let view =
             View { camera: grant.camera, shading: shot.shading.clone(), quality: shot.quality };
         let (lease, region) = (grant.lease, grant.region);
-        self.launch(lease, move |caster| Job::new(caster, lease, view, region, stop))
+        self.launch(lease, move |caster| Box::new(Job::new(caster, lease, view, region, stop)))
     }
 
     fn resume(&mut self, lease: LeaseId) -> Option<Event> {
@@ -265,7 +265,7 @@ impl<'a, C: Caster> Shift<'a, C> {
     fn launch(
         &mut self,
         lease: LeaseId,
-        job: impl FnOnce(&C) -> Job<C> + Send + 'static,
+        job: impl FnOnce(&C) -> Box<Job<C>> + Send + 'static,
     ) -> Option<Event> {
         let scene = self.current.as_ref().and_then(|(store, _)| self.site.terrain.scene(*store));
         let Some(scene) = scene else {

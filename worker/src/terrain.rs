@@ -84,14 +84,14 @@ impl<P> Terrain<P> {
             return;
         }
         self.idle.push_back(store);
-        if self.idle.len() > IDLE_STORES_MAX {
-            if let Some(oldest) = self.idle.pop_front() {
-                self.stores.remove(&oldest);
-                let gone = |loaded: &Loaded| loaded.place.store == oldest;
-                self.bytes -= self.loaded.iter().filter(|l| gone(l)).map(|l| l.bytes).sum::<u64>();
-                self.loaded.retain(|loaded| !gone(loaded));
-                self.pinned = self.pinned.min(self.loaded.len());
-            }
+        if self.idle.len() > IDLE_STORES_MAX
+            && let Some(oldest) = self.idle.pop_front()
+        {
+            self.stores.remove(&oldest);
+            let gone = |loaded: &Loaded| loaded.place.store == oldest;
+            self.bytes -= self.loaded.iter().filter(|l| gone(l)).map(|l| l.bytes).sum::<u64>();
+            self.loaded.retain(|loaded| !gone(loaded));
+            self.pinned = self.pinned.min(self.loaded.len());
         }
     }
 
