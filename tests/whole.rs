@@ -1,1 +1,27 @@
-//! Whole-program tests.
+//! Whole-program tests: real processes, real sockets, real files.
+#![allow(clippy::unwrap_used)]
+
+/// A fresh folder and the program, as a test needs them.
+#[path = "whole/support.rs"]
+mod support;
+
+/// The house keeps its shape: which crate may depend on which.
+#[path = "whole/tidy.rs"]
+mod tidy;
+
+/// The same picture for any number of workers and any split; workers that die, fall
+/// silent, are cut off or come late.
+#[path = "whole/farm.rs"]
+mod farm;
+
+/// What is wrong is said, nothing half-written stays, the exit code is 2.
+#[path = "whole/bad_input.rs"]
+mod bad_input;
+
+/// Commands that write files: what they leave, and what it says.
+#[path = "whole/commands.rs"]
+mod commands;
+
+/// Every command in the documents is one that works.
+#[path = "whole/documents.rs"]
+mod documents;

@@ -1,2 +1,66 @@
-#![allow(missing_docs)]
-fn main() {}
+//! The program `terrafarm`: reads what the user typed, calls the parts, prints.
+//!
+//! `args` mirrors the command line; every other module carries out one command. Nothing
+//! here decides who renders what, and nothing here touches a pixel.
+//!
+//! Exit codes: 0 done, 1 finished with failed frames, 2 could not run.
+
+mod args;
+mod commands;
+mod farm;
+mod input;
+mod place;
+mod progress;
+mod shot;
+
+use clap::Parser;
+use std::process::ExitCode;
+
+/// How a command that ran to its end ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Everything was done.
+    Done,
+    /// The command finished, but some frames failed.
+    FailedFrames,
+}
+
+fn main() -> ExitCode {
+    let args = match args::Args::try_parse() {
+        Ok(args) => args,
+        Err(refusal) => {
+            // Help and version are not errors; clap prints both kinds where they belong.
+            let code = if refusal.use_stderr() { 2 } else { 0 };
+            let _ = refusal.print();
+            return ExitCode::from(code);
+        }
+    };
+    log_to_stderr(args.verbose);
+    match commands::run(args.command) {
+        Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::FailedFrames) => ExitCode::from(1),
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("terrafarm: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Whoever read our output has seen enough (`terrafarm ... | head`).
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause
+            .downcast_ref::<std::io::Error>()
+            .is_some_and(|io| io.kind() == std::io::ErrorKind::BrokenPipe)
+    })
+}
+
+fn log_to_stderr(verbose: u8) {
+    let level = match verbose {
+        0 => tracing::Level::WARN,
+        1 => tracing::Level::INFO,
+        _ => tracing::Level::DEBUG,
+    };
+    tracing_subscriber::fmt().with_max_level(level).with_writer(std::io::stderr).init();
+}

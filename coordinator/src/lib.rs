@@ -1,1 +1,17 @@
-//! The coordinator: driver task, peers, sinks.
+//! The coordinator: driver task, peers, clients and the files that pictures go to.
+//!
+//! [`run`] serves a farm. One task, the driver, owns everything that is decided
+//! (`farm::Farm`: scheduler, film, blob broker); every connection has one task that reads
+//! and one that writes, and talks to the driver through bounded channels. [`client`] is
+//! the other side: it submits a shot, supplies terrain, and takes frames. [`sink`] writes
+//! frames to files.
+
+mod blobs;
+pub mod client;
+mod driver;
+mod farm;
+mod peer;
+mod shots;
+pub mod sink;
+
+pub use driver::{Config, CoordinatorError, run};

@@ -39,6 +39,8 @@ pub const CAMERAS_MAX: usize = 1024;
 pub const FRAMES_MAX: u32 = 1 << 20;
 /// Most finished frames that may wait for a client.
 pub const FRAMES_IN_FLIGHT_MAX: u32 = 1024;
+/// Most workers named in the summary of a shot: 128 of the longest names are 34 KiB.
+pub const WORKER_SHARES_MAX: usize = 128;
 /// Most render threads of one worker.
 pub const THREADS_MAX: u32 = 4096;
 

@@ -17,7 +17,7 @@ pub use blob::{Blob, NoBlob, WantBlobs};
 pub use hello::{Goodbye, Hello, Ping, Pong, Refusal, Refused, Role, Versions, Welcome};
 pub use shot::{
     Accepted, Cameras, Cancel, Frame, FrameFailed, FrameTaken, Progress, Rejected, ShotDone,
-    ShotFailed, Submit,
+    ShotFailed, Submit, WorkerShare,
 };
 pub use work::{CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke};
 

@@ -6,15 +6,15 @@
 //! the number of threads. Coarser levels are made from the tiles already written, a strip
 //! at a time, so that memory stays within about 100 MB whatever the size of the layer.
 
-use crate::codec::{CodecError, MAX_TILE_BYTES, TILE_AREA};
+use self::levels::Made;
+use crate::codec::{CodecError, MAX_TILE_BYTES};
 use crate::layout::{
-    HeightDatum, ImportReport, Layer, LayerKind, Level, MAX_LAYERS, MAX_POSTS, MAX_TILES,
-    PostWindow, STORE_VERSION, StoreIndex, TILE_CELLS, TILE_POSTS, TILE_RING, TileEntry,
+    HeightDatum, ImportReport, Layer, LayerKind, MAX_LAYERS, MAX_POSTS, MAX_TILES, STORE_VERSION,
+    StoreIndex, TileEntry,
 };
-use crate::positioned::{read_exact_at, write_all_at};
-use crate::pyramid::{FINE_REACH, FinePosts, Post, post_in_tile};
+use crate::positioned::write_all_at;
+use crate::pyramid::Post;
 use crate::store::{HEADER_BYTES, Header, MAX_INDEX_BYTES, hash_of};
-use rayon::prelude::*;
 use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io;
@@ -22,10 +22,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use terrafarm_common::id::BlobHash;
 
-/// Level 0 tiles in work at once: 17 MB of heights.
-const BATCH: usize = 64;
-/// Coarse tiles in work at once, all of one row: 26 MB of finer heights.
-const COARSE_BATCH: u32 = 16;
 /// Steps of a coarser level within one of level 0: what the tent filter of whole steps
 /// needs to be exact.
 const COARSE_STEPS: f64 = 16.0;
@@ -195,13 +191,6 @@ impl Watch<'_> {
     }
 }
 
-/// A tile that is ready to be written: its bytes, and its entry but for the place.
-struct Made {
-    bytes: Vec<u8>,
-    entry: TileEntry,
-    void_posts: u64,
-}
-
 impl StoreBuilder {
     /// Begins a store. Fields as in [`StoreIndex`]. An existing store of that name stays
     /// as it is until [`StoreBuilder::finish`] replaces it.
@@ -314,23 +303,23 @@ impl StoreBuilder {
         if layer == MAX_LAYERS {
             return refuse(format!("at most {MAX_LAYERS} layers are allowed; merge some inputs"));
         }
-        let numbers_fit = spec.origin.iter().chain(&spec.spacing).all(|value| value.is_finite())
-            && spec.spacing.iter().all(|&step| step > 0.0)
-            && spec.quantum_m.is_none_or(|step| step.is_finite() && step > 0.0);
-        if !numbers_fit {
-            return refuse(
-                "origin, spacing and quantum must be numbers, the last two above 0".into(),
-            );
-        }
         let [width, height] = spec.posts;
         if spec.posts.iter().any(|&n| n == 0 || n > MAX_POSTS) {
             return refuse(format!(
                 "{width} x {height} posts; 1 to {MAX_POSTS} a side are allowed; cut it or use a coarser spacing"
             ));
         }
-        let shape = shape(spec);
+        let numbers_fit = spec.origin.iter().chain(&spec.spacing).all(|value| value.is_finite())
+            && spec.spacing.iter().all(|&step| step > 0.0)
+            && shape(spec).far_corner().iter().all(|value| value.is_finite())
+            && spec.quantum_m.is_none_or(|step| step.is_finite() && step > 0.0);
+        if !numbers_fit {
+            return refuse(
+                "origin, spacing and quantum must be numbers, the last two above 0".into(),
+            );
+        }
         let tiles: u64 = (0..Layer::level_count(spec.posts))
-            .map(|level| Layer::tiles_for(shape.level_posts(level)))
+            .map(|level| Layer::tiles_for(shape(spec).level_posts(level)))
             .map(|[columns, rows]| u64::from(columns) * u64::from(rows))
             .sum();
         let layers = self.index.layers.iter().flat_map(|layer| &layer.levels);
@@ -360,105 +349,6 @@ impl StoreBuilder {
             layer.levels.push(coarser);
         }
         Ok(layer)
-    }
-
-    fn build_finest<P: Post>(
-        &mut self,
-        posts: [u64; 2],
-        step: Option<f64>,
-        source: &dyn LayerSource,
-        watch: &mut Watch<'_>,
-    ) -> Result<Level, BuildError> {
-        let number = self.index.layers.len();
-        let tiles = Layer::tiles_for(posts);
-        let count = tiles[0] as usize * tiles[1] as usize;
-        let mut entries = Vec::with_capacity(count);
-        for first in (0..count).step_by(BATCH) {
-            let made: Result<Vec<Made>, SourceError> = (first..count.min(first + BATCH))
-                .into_par_iter()
-                .map(|at| {
-                    let [tx, ty] = [at % tiles[0] as usize, at / tiles[0] as usize];
-                    let [tx, ty] = [tx as u32, ty as u32];
-                    let tile = read_tile::<P>(source, tx, ty, posts)?;
-                    Ok(make(&tile, step, count_voids(&tile, tx, ty, posts), || 0.0))
-                })
-                .collect();
-            let made = made.map_err(|source| BuildError::Source { layer: number, source })?;
-            self.append(made, &mut entries, watch)?;
-        }
-        Ok(Level { tiles, entries })
-    }
-
-    fn build_coarser<P: Post>(
-        &mut self,
-        layer: &Layer,
-        level: usize,
-        step: Option<f64>,
-        watch: &mut Watch<'_>,
-    ) -> Result<Level, BuildError> {
-        let posts = layer.level_posts(level);
-        let tiles = Layer::tiles_for(posts);
-        let mut entries = Vec::with_capacity(tiles[0] as usize * tiles[1] as usize);
-        for ty in 0..tiles[1] {
-            for first in (0..tiles[0]).step_by(COARSE_BATCH as usize) {
-                let end = tiles[0].min(first + COARSE_BATCH);
-                let fine = self.fine_posts::<P>(layer, level - 1, first..end, ty)?;
-                let made = (first..end)
-                    .into_par_iter()
-                    .map(|tx| {
-                        let tile = fine.coarse_tile(tx, ty, posts, step);
-                        let below = deviation_below(layer, level - 1, tx, ty);
-                        make(&tile, step, 0, || round_up(fine.deviation(tx, ty, &tile) + below))
-                    })
-                    .collect();
-                self.append(made, &mut entries, watch)?;
-            }
-        }
-        Ok(Level { tiles, entries })
-    }
-
-    /// The posts of a finished level under a run of coarse tiles of one row, read back.
-    fn fine_posts<P: Post>(
-        &self,
-        layer: &Layer,
-        level: usize,
-        columns: std::ops::Range<u32>,
-        row: u32,
-    ) -> Result<FinePosts<P>, BuildError> {
-        let grid = layer.level_posts(level);
-        let side = 2 * TILE_CELLS as i64;
-        let reach = FINE_REACH as i64;
-        let window = PostWindow::clipped(
-            [i64::from(columns.start) * side - reach, i64::from(row) * side - reach],
-            [i64::from(columns.end) * side + reach, (i64::from(row) + 1) * side + reach],
-            grid,
-        );
-        let tiles = layer.levels[level].tiles;
-        let span = |first: u64, length: usize, count: u32| {
-            let tile_of = |post: u64| ((post / TILE_CELLS as u64) as u32).min(count - 1);
-            tile_of(first)..=tile_of(first + length as u64 - 1)
-        };
-        let keys: Vec<[u32; 2]> = span(window.j0, window.height, tiles[1])
-            .flat_map(|ty| span(window.i0, window.width, tiles[0]).map(move |tx| [tx, ty]))
-            .collect();
-        let decoded: Result<Vec<Option<Vec<P>>>, BuildError> =
-            keys.par_iter().map(|&[tx, ty]| self.read_back(layer.entry(level, tx, ty))).collect();
-        let mut posts = vec![P::VOID; window.area()];
-        for (key, tile) in keys.iter().zip(decoded?) {
-            if let Some(tile) = tile {
-                copy_tile(*key, &tile, window, &mut posts);
-            }
-        }
-        Ok(FinePosts { grid, window, posts })
-    }
-
-    fn read_back<P: Post>(&self, entry: Option<&TileEntry>) -> Result<Option<Vec<P>>, BuildError> {
-        let Some(entry) = entry.filter(|entry| !entry.is_empty()) else { return Ok(None) };
-        let path = || self.partial.path.clone();
-        let mut bytes = vec![0; entry.length as usize];
-        read_exact_at(&self.partial.file, &mut bytes, entry.offset)
-            .map_err(|source| BuildError::Io { path: path(), source })?;
-        P::decode(&bytes).map(Some).map_err(|source| BuildError::ReadBack { path: path(), source })
     }
 
     /// Writes a batch in order; a tile that is there already is not written again.
@@ -503,94 +393,6 @@ fn shape(spec: &LayerSpec) -> Layer {
     Layer { kind, origin, spacing, posts, levels: Vec::new() }
 }
 
-/// A tile of level 0; what lies outside the layer is void.
-fn read_tile<P: Post>(
-    source: &dyn LayerSource,
-    tx: u32,
-    ty: u32,
-    posts: [u64; 2],
-) -> Result<Vec<P>, SourceError> {
-    let window = PostWindow::of_tile(tx, ty, posts);
-    let mut read = vec![P::VOID; window.area()];
-    P::read(source, window, &mut read)?;
-    let mut tile = vec![P::VOID; TILE_AREA];
-    for (row, read) in read.chunks_exact(window.width).enumerate() {
-        let start = post_in_tile([tx, ty], [window.i0, window.j0 + row as u64]);
-        for (post, read) in tile[start..].iter_mut().zip(read) {
-            *post = read.cleaned();
-        }
-    }
-    Ok(tile)
-}
-
-/// Encodes a tile and measures it. `deviation` is asked only if anything is valid.
-fn make<P: Post>(
-    tile: &[P],
-    step: Option<f64>,
-    void_posts: u64,
-    deviation: impl Fn() -> f32,
-) -> Made {
-    let rows = tile.chunks_exact(TILE_POSTS).skip(TILE_RING).take(TILE_CELLS + 1);
-    let inner = || rows.clone().flat_map(|row| row[TILE_RING..TILE_POSTS - TILE_RING].iter());
-    if inner().all(|post| post.is_void()) {
-        return Made { bytes: Vec::new(), entry: TileEntry::EMPTY, void_posts };
-    }
-    let bytes = P::encode(tile, step);
-    let (min, max) = P::extent(inner().copied());
-    let entry = TileEntry {
-        hash: hash_of(&bytes),
-        offset: 0,
-        length: bytes.len() as u32,
-        min,
-        max,
-        deviation: deviation(),
-    };
-    Made { bytes, entry, void_posts }
-}
-
-/// Void posts of a height tile of level 0; one that two tiles share counts for the
-/// eastern or northern one.
-fn count_voids<P: Post>(tile: &[P], tx: u32, ty: u32, posts: [u64; 2]) -> u64 {
-    if P::KIND != LayerKind::Height {
-        return 0;
-    }
-    let tiles = Layer::tiles_for(posts);
-    let end = |t: u32, axis: usize| {
-        if t + 1 == tiles[axis] { posts[axis] } else { u64::from(t + 1) * TILE_CELLS as u64 }
-    };
-    let start = [tx, ty].map(|t| u64::from(t) * TILE_CELLS as u64);
-    let places = (start[1]..end(ty, 1)).flat_map(|j| (start[0]..end(tx, 0)).map(move |i| [i, j]));
-    places.filter(|&place| tile[post_in_tile([tx, ty], place)].is_void()).count() as u64
-}
-
-/// Copies what a tile, ring left out, has of a window.
-fn copy_tile<P: Post>([tx, ty]: [u32; 2], tile: &[P], window: PostWindow, posts: &mut [P]) {
-    let overlap = |t: u32, first: u64, length: usize| {
-        let start = u64::from(t) * TILE_CELLS as u64;
-        start.max(first)..(start + TILE_CELLS as u64 + 1).min(first + length as u64)
-    };
-    let columns = overlap(tx, window.i0, window.width);
-    let width = (columns.end - columns.start) as usize;
-    for j in overlap(ty, window.j0, window.height) {
-        let from = post_in_tile([tx, ty], [columns.start, j]);
-        let to = (j - window.j0) as usize * window.width + (columns.start - window.i0) as usize;
-        posts[to..to + width].copy_from_slice(&tile[from..from + width]);
-    }
-}
-
-/// The largest deviation of the tiles of a level under a tile of the next coarser one.
-fn deviation_below(layer: &Layer, level: usize, tx: u32, ty: u32) -> f64 {
-    let children = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| (2 * tx + dx, 2 * ty + dy));
-    let entries = children.into_iter().filter_map(|(tx, ty)| layer.entry(level, tx, ty));
-    entries.map(|entry| f64::from(entry.deviation)).fold(0.0, f64::max)
-}
-
-/// The smallest f32 that is not below.
-fn round_up(value: f64) -> f32 {
-    let nearest = value as f32;
-    if f64::from(nearest) < value { nearest.next_up() } else { nearest }
-}
-
 /// Makes the new name itself durable, where the system can.
 fn sync_folder(path: &Path) {
     if cfg!(unix) {
@@ -601,5 +403,6 @@ fn sync_folder(path: &Path) {
     }
 }
 
+mod levels;
 #[cfg(test)]
 mod tests;

@@ -13,7 +13,7 @@
 
 use crate::store::hash_of;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -96,8 +96,10 @@ impl BlobCache {
         let path = self.path_of(hash);
         let file = File::open(&path).ok()?;
         let length = file.metadata().ok()?.len();
-        let bytes = if length <= self.limit_bytes { fs::read(&path).ok()? } else { Vec::new() };
-        if hash_of(&bytes) != *hash {
+        let mut bytes = Vec::new();
+        let whole = length <= self.limit_bytes
+            && file.take(self.limit_bytes).read_to_end(&mut bytes).ok()? as u64 == length;
+        if !whole || hash_of(&bytes) != *hash {
             // Another process may have put a sound one in its place meanwhile; it will be
             // fetched again, which is harmless.
             if fs::remove_file(&path).is_ok() {

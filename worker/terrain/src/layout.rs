@@ -274,6 +274,9 @@ impl Layer {
         if self.posts.iter().any(|&n| n == 0 || n > MAX_POSTS) {
             return Err(format!("{} x {} posts is out of range", self.posts[0], self.posts[1]));
         }
+        if self.far_corner().iter().any(|value| !value.is_finite()) {
+            return Err("its far corner is out of range".into());
+        }
         if self.levels.len() != Layer::level_count(self.posts) {
             return Err(format!("{} levels do not fit its size", self.levels.len()));
         }

@@ -77,7 +77,8 @@ pub(crate) trait Post: Copy + Send + Sync + 'static {
     fn extent(posts: impl Iterator<Item = Self>) -> (f32, f32);
 
     /// The largest distance between the bilinear surface of a coarse cell and that of
-    /// the up to four fine cells within; see the module's documentation.
+    /// the up to four fine cells within (`None` beyond the grid); see the module's
+    /// documentation. Infinite if one of those is void, 0 if the coarse one is.
     fn cell_deviation(coarse: [Self; 4], fine: [[Option<Self>; 3]; 3]) -> f64;
 }
 
@@ -138,18 +139,14 @@ impl Post for f32 {
             return 0.0;
         }
         let [sw, se, nw, ne] = coarse.map(f64::from);
+        let [west, east] = [[sw, (sw + nw) / 2.0, nw], [se, (se + ne) / 2.0, ne]];
         let mut deviation: f64 = 0.0;
-        for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-            let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(j, i)| (row + j, column + i));
-            if corners.iter().any(|&(j, i)| fine[j][i].is_none()) {
-                continue;
-            }
-            for (j, i) in corners {
-                let (u, v) = (i as f64 / 2.0, j as f64 / 2.0);
-                let south = sw * (1.0 - u) + se * u;
-                let north = nw * (1.0 - u) + ne * u;
-                let height = fine[j][i].map_or(f64::NAN, f64::from);
-                let apart = (south * (1.0 - v) + north * v - height).abs();
+        for (row, fine) in fine.iter().enumerate() {
+            let across = [west[row], (west[row] + east[row]) / 2.0, east[row]];
+            for (coarse, fine) in across.into_iter().zip(fine) {
+                // A coarse cell begins before the last fine post, so that every fine post
+                // here is the corner of a fine cell here: if it is void, so is the cell.
+                let apart = fine.map_or(0.0, |fine| (coarse - f64::from(fine)).abs());
                 deviation = if apart.is_nan() { f64::INFINITY } else { deviation.max(apart) };
                 if deviation.is_infinite() {
                     return deviation;
@@ -272,8 +269,12 @@ impl<P: Post> FinePosts<P> {
         tile
     }
 
-    /// The largest distance between a coarse tile's surface and this level's.
+    /// The largest distance between a coarse tile's surface and this level's; 0 for
+    /// photos.
     pub(crate) fn deviation(&self, tx: u32, ty: u32, tile: &[P]) -> f64 {
+        if P::KIND == LayerKind::Photo {
+            return 0.0;
+        }
         let mut deviation: f64 = 0.0;
         for j in 0..TILE_CELLS {
             for i in 0..TILE_CELLS {
@@ -282,9 +283,6 @@ impl<P: Post> FinePosts<P> {
                     [tile[at], tile[at + 1], tile[at + TILE_POSTS], tile[at + TILE_POSTS + 1]];
                 let west = 2 * (u64::from(tx) * TILE_CELLS as u64 + i as u64);
                 let south = 2 * (u64::from(ty) * TILE_CELLS as u64 + j as u64);
-                if west >= self.grid[0] || south >= self.grid[1] {
-                    continue;
-                }
                 let fine = [0, 1, 2].map(|row| {
                     [0, 1, 2].map(|column| {
                         let place = [west + column, south + row];

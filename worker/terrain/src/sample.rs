@@ -67,8 +67,10 @@ impl<'a> Sampler<'a> {
     /// If a tile cannot be read.
     pub fn height_at(&mut self, x: f64, y: f64) -> Result<Option<f64>, StoreError> {
         let index = self.store.index().clone();
-        let layers: Vec<_> = index.layers_of(LayerKind::Height).collect();
-        for (number, layer) in layers.into_iter().rev() {
+        for (number, layer) in index.layers.iter().enumerate().rev() {
+            if layer.kind != LayerKind::Height {
+                continue;
+            }
             if let Some(height) = self.height_in_layer(number as u16, layer, x, y)? {
                 return Ok(Some(height));
             }

@@ -311,7 +311,11 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::fixture::{Ground, height_layer, hills};
+    use proptest::prelude::*;
     use std::fs;
+    use std::sync::OnceLock;
+
+    static INDEX: OnceLock<Vec<u8>> = OnceLock::new();
 
     fn store() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
@@ -395,6 +399,30 @@ mod tests {
         assert!(matches!(StoreReader::open(&path), Err(StoreError::Index { .. })));
         fs::remove_file(&path).unwrap();
         assert!(matches!(StoreReader::open(&path), Err(StoreError::Io { .. })));
+    }
+
+    proptest! {
+        #[test]
+        fn any_index_is_read_or_refused(at: prop::sample::Index, bytes in prop::collection::vec(any::<u8>(), 0..40)) {
+            let _ = decode_index(&bytes);
+            let index = INDEX.get_or_init(|| {
+                let (_folder, path) = store();
+                StoreReader::open(&path).unwrap().index_blob().1.to_vec()
+            });
+            let mut changed = index.clone();
+            let start = at.index(changed.len());
+            let end = changed.len().min(start + bytes.len());
+            changed.splice(start..end, bytes);
+            if let Ok(index) = decode_index(&changed) {
+                // Whatever passes the check can be used.
+                let resident = crate::resident::Resident::new(Arc::new(index.clone()));
+                prop_assert_eq!(resident.bytes(), 0);
+                for layer in &index.layers {
+                    prop_assert!(layer.far_corner().iter().all(|value| value.is_finite()));
+                    prop_assert_eq!(layer.levels.last().unwrap().entries.len(), 1);
+                }
+            }
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 //! and answers every [`Frame`] by a [`FrameTaken`], which lets the next one be sent.
 
 use super::{Body, Unfit, fit_name, fit_reason, own_twin};
-use crate::limits::{CAMERAS_MAX, FRAMES_IN_FLIGHT_MAX, FRAMES_MAX};
+use crate::limits::{CAMERAS_MAX, FRAMES_IN_FLIGHT_MAX, FRAMES_MAX, WORKER_SHARES_MAX};
 use crate::message::work::RenderReport;
 use crate::pixels::Pixels;
 use crate::twin::{
@@ -271,8 +271,19 @@ impl Body for Progress {
     own_twin!();
 }
 
+/// What one worker did for a shot.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkerShare {
+    /// Its name; workers of the same name count as one.
+    pub name: String,
+    /// Jobs whose pixels were used.
+    pub jobs: u64,
+    /// Time it rendered for them, microseconds.
+    pub cost_us: u64,
+}
+
 /// Every frame is made or has failed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ShotDone {
     /// The shot.
     pub shot: ShotId,
@@ -288,10 +299,18 @@ pub struct ShotDone {
     pub elapsed_us: u64,
     /// Sum over all jobs.
     pub report: RenderReport,
+    /// Who rendered how much, at most [`WORKER_SHARES_MAX`] workers.
+    pub workers: Vec<WorkerShare>,
 }
 
 impl Body for ShotDone {
     own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        let fits = self.workers.len() <= WORKER_SHARES_MAX;
+        Unfit::unless(fits, "too many workers in one message")?;
+        self.workers.iter().try_for_each(|share| fit_name(&share.name))
+    }
 }
 
 /// The shot has been given up; no more frames come.

@@ -1,7 +1,8 @@
 #![allow(clippy::unwrap_used)]
+use super::levels::BATCH;
 use super::*;
 use crate::fixture::{Ground, height_layer, hills};
-use crate::layout::TileKey;
+use crate::layout::{TILE_CELLS, TileKey};
 use crate::resident::Tile;
 use crate::store::StoreReader;
 use crate::tile::HeightTile;
@@ -275,6 +276,8 @@ fn sizes_beyond_the_limits_are_refused_before_anything_is_read() {
     assert!(refused(height_layer([MAX_POSTS, MAX_POSTS])).contains("tiles"));
     assert!(refused(height_layer([u64::MAX, u64::MAX])).contains("posts"));
     refused(LayerSpec { spacing: [0.0, 1.0], ..height_layer([5, 5]) });
+    refused(LayerSpec { spacing: [1e308, 1.0], ..height_layer([5, 5]) });
+    refused(LayerSpec { quantum_m: Some(0.0), ..height_layer([5, 5]) });
     refused(LayerSpec { origin: [f64::NAN, 1.0], ..height_layer([5, 5]) });
     let missing = create("no/such/folder.terrain").err().unwrap().to_string();
     assert!(missing.contains("does the folder exist?"), "{missing}");
@@ -312,4 +315,21 @@ fn photos_keep_their_colors_and_fade_into_nothing() {
     // Post 50 lies over 99, 100 and 101: a quarter of the weight is covered.
     assert_eq!(texel(1, 50), crate::color::linear_premultiplied([10, 200, 30, 64]));
     assert_eq!(store.index().layers[1].levels[0].entries[1], TileEntry::EMPTY);
+}
+
+#[test]
+fn a_decimal_quantum_means_the_decimal() {
+    let folder = tempfile::tempdir().unwrap();
+    let terrain_rgb = |i: u64, j: u64| (-10000.0 + 0.1 * (100_000 + 37 * i + 11 * j) as f64) as f32;
+    let size = |quantum_m: Option<f32>| {
+        let path = folder.path().join("a.terrain");
+        let spec = LayerSpec { quantum_m, ..height_layer([257, 257]) };
+        Ground::new().heights(spec, terrain_rgb).build(&path).unwrap();
+        let store = StoreReader::open(&path).unwrap();
+        assert_eq!(post(&store, 0, 200, 100), terrain_rgb(200, 100));
+        store.index().layers[0].levels[0].entries[0].length
+    };
+    let (tenths, floats) = (size(Some(0.1)), size(None));
+    assert!(tenths * 10 < floats, "{tenths} and {floats} bytes");
+    assert!(size(Some(0.3)) <= floats, "a quantum that does not fit costs nothing");
 }

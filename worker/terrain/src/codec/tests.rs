@@ -182,3 +182,25 @@ proptest! {
         prop_assert!(same_bits(&expected, &decoded));
     }
 }
+
+#[test]
+fn tiles_of_version_1_are_read_and_written_as_ever() {
+    let heights = include_bytes!("golden-v1-heights.bin");
+    assert!(same_bits(&golden_posts(), &decode_posts(heights).unwrap()));
+    assert!(encode_heights(&golden_posts(), Some(0.5)) == heights, "the hash of tiles changes");
+    let colors = include_bytes!("golden-v1-colors.bin");
+    assert!(golden_colors() == decode_colors(colors).unwrap());
+    assert!(encode_colors(&golden_colors()) == colors, "the hash of tiles changes");
+}
+
+fn golden_posts() -> Vec<f32> {
+    posts(
+        |i, j| {
+            if i < 3 { f32::NAN } else { 100.5 + 0.5 * i as f32 + if j > 200 { 7.0 } else { 0.0 } }
+        },
+    )
+}
+
+fn golden_colors() -> Vec<[u8; 4]> {
+    (0..TILE_AREA).map(|post| if post < 9999 { [1, 200, 30, 255] } else { [9, 8, 7, 6] }).collect()
+}

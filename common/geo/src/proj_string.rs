@@ -1,0 +1,89 @@
+//! A proj string as a list of parameters that can be looked up and rewritten.
+
+use std::fmt;
+
+/// Parameters in the order in which they were written; `+no_defs` has no value.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct ProjString {
+    parameters: Vec<(String, Option<String>)>,
+}
+
+impl ProjString {
+    /// Splits `+name=value` words; the plus signs may be missing. Values keep their
+    /// case, names are lower-cased except for the few that differ only by case.
+    pub(crate) fn parse(text: &str) -> Self {
+        let mut parsed = ProjString::default();
+        for word in text.split_ascii_whitespace() {
+            let word = word.strip_prefix('+').unwrap_or(word);
+            let (name, value) = match word.split_once('=') {
+                Some((name, value)) => (name, Some(value.trim_matches('"').to_owned())),
+                None => (word, None),
+            };
+            if name.is_empty() || parsed.get(name).is_some() {
+                continue;
+            }
+            // R and r, R_A and R_a mean different things.
+            let name = if name.starts_with('R') { name.into() } else { name.to_lowercase() };
+            parsed.parameters.push((name, value));
+        }
+        parsed
+    }
+
+    /// The value of a parameter; `None` if it is absent or a bare flag.
+    pub(crate) fn get(&self, name: &str) -> Option<&str> {
+        self.parameters.iter().find(|(n, _)| n == name).and_then(|(_, value)| value.as_deref())
+    }
+
+    /// The value as a number, if it is one.
+    pub(crate) fn number(&self, name: &str) -> Option<f64> {
+        self.get(name)?.parse().ok().filter(|value: &f64| value.is_finite())
+    }
+
+    /// Sets or replaces a parameter.
+    pub(crate) fn set(&mut self, name: &str, value: impl Into<String>) {
+        self.remove(name);
+        self.parameters.push((name.to_owned(), Some(value.into())));
+    }
+
+    /// Sets a number, written so that it reads back exactly.
+    pub(crate) fn set_number(&mut self, name: &str, value: f64) {
+        self.set(name, value.to_string());
+    }
+
+    /// Takes a parameter away and returns its value.
+    pub(crate) fn remove(&mut self, name: &str) -> Option<String> {
+        let at = self.parameters.iter().position(|(n, _)| n == name)?;
+        self.parameters.remove(at).1
+    }
+
+    /// Without the words that change nothing, sorted: equal for equal definitions.
+    pub(crate) fn sorted(&self) -> Self {
+        let idle = ["no_defs", "type", "wktext"];
+        let neutral = |name: &str, value: &Option<String>| {
+            let number = value.as_deref().and_then(|text| text.parse::<f64>().ok());
+            match name {
+                "x_0" | "y_0" | "lat_0" | "lon_0" => number == Some(0.0),
+                "k" | "k0" => number == Some(1.0),
+                "units" => value.as_deref() == Some("m"),
+                _ => idle.contains(&name),
+            }
+        };
+        let mut parameters = self.parameters.clone();
+        parameters.retain(|(name, value)| !neutral(name, value));
+        parameters.sort();
+        ProjString { parameters }
+    }
+}
+
+impl fmt::Display for ProjString {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (number, (name, value)) in self.parameters.iter().enumerate() {
+            let gap = if number == 0 { "" } else { " " };
+            match value {
+                Some(value) => write!(f, "{gap}+{name}={value}")?,
+                None => write!(f, "{gap}+{name}")?,
+            }
+        }
+        Ok(())
+    }
+}

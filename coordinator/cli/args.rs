@@ -1,0 +1,357 @@
+//! The command line as typed.
+
+use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use terrafarm_common::quality::Method;
+use terrafarm_common::region::Split;
+
+/// Flies a camera over real terrain, rendered by every PC in the office.
+#[derive(Debug, Parser)]
+#[command(name = "terrafarm", version, max_term_width = 100)]
+pub struct Args {
+    /// Say more on stderr; twice for everything
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// What to do
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Make procedural terrain, fly over it with two local workers, leave a video
+    Demo(Demo),
+    /// Make, inspect and sample terrain stores
+    #[command(subcommand)]
+    Terrain(Terrain),
+    /// Render a flight over a scene to a video or to pictures
+    Render(Render),
+    /// Serve a farm: workers and renders connect here
+    Coordinator(Coordinator),
+    /// Render for a coordinator until told to stop
+    Worker(Worker),
+    /// Run the real scheduler on a virtual clock, with workers that fail
+    Simulate(Simulate),
+}
+
+/// `terrafarm demo`
+#[derive(Debug, ClapArgs)]
+pub struct Demo {
+    /// Folder for everything the demo makes
+    #[arg(short, long, default_value = "out/demo")]
+    pub output: PathBuf,
+    /// Local worker processes
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub workers: u32,
+    /// Seed of the terrain
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `terrafarm terrain ...`
+#[derive(Debug, Subcommand)]
+pub enum Terrain {
+    /// Turn elevation files, photos and finer insets into one NAME.terrain
+    Import(Box<Import>),
+    /// Say what a store contains
+    Info {
+        /// The store
+        store: PathBuf,
+        /// Print as JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the height at points: CSV in (`lon,lat` or `x,y`), CSV out with `height_m`
+    Sample {
+        /// The store
+        store: PathBuf,
+        /// CSV file of points with a header line; `-` for standard input
+        #[arg(long)]
+        points: PathBuf,
+    },
+    /// Make procedural terrain of any size and seed
+    Synth(Synth),
+    /// Write a hillshade of a store as a grey PNG, to look at it
+    Hillshade {
+        /// The store
+        store: PathBuf,
+        /// The PNG to write
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Direction of the light, degrees clockwise from grid north
+        #[arg(long, default_value_t = 315.0)]
+        azimuth: f64,
+        /// Height of the light above the horizon, degrees
+        #[arg(long, default_value_t = 45.0)]
+        altitude: f64,
+    },
+}
+
+/// `terrafarm terrain import`
+#[derive(Debug, ClapArgs)]
+pub struct Import {
+    /// Elevation files: GeoTIFF, .hgt, .hgt.zip, ESRI ASCII grid, USGS .dem, PNG
+    #[arg(required = true)]
+    pub elevation: Vec<PathBuf>,
+    /// The store to write
+    #[arg(short, long)]
+    pub output: PathBuf,
+    /// Aerial photo: GeoTIFF, or JPEG or PNG with a world file (may be given again)
+    #[arg(long = "photo", value_name = "FILE")]
+    pub photos: Vec<PathBuf>,
+    /// Finer elevation for a part of the ground (may be given again)
+    #[arg(long = "inset", value_name = "FILE")]
+    pub insets: Vec<PathBuf>,
+    /// Metric reference system of the store, such as EPSG:32612 [default: the inputs'
+    /// own if metric, else the UTM zone of their centre]
+    #[arg(long)]
+    pub crs: Option<String>,
+    /// Reference system of files that do not say theirs
+    #[arg(long)]
+    pub source_crs: Option<String>,
+    /// Fill voids up to this many posts wide from their rim
+    #[arg(long, value_name = "POSTS")]
+    pub fill_voids: Option<u32>,
+    /// How heights are packed into RGB of a PNG
+    #[arg(long, value_enum, default_value_t = PngEncoding::Auto)]
+    pub png_encoding: PngEncoding,
+    /// Web Mercator tile that a PNG without a world file covers, as Z/X/Y
+    #[arg(long, value_name = "Z/X/Y")]
+    pub tile: Option<String>,
+    /// Unit of heights where the file does not say, or says it wrong
+    #[arg(long, value_enum)]
+    pub height_unit: Option<HeightUnit>,
+    /// Colour of a photo that means "no photo here", such as ffffff
+    #[arg(long, value_name = "RRGGBB")]
+    pub collar: Option<String>,
+    /// Replace an existing store
+    #[arg(long)]
+    pub force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// How heights are packed into the colours of a PNG.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum PngEncoding {
+    /// Find out, or ask if it is not certain
+    Auto,
+    /// Mapbox: -10000 + 0.1 (65536 R + 256 G + B)
+    TerrainRgb,
+    /// Terrarium: 256 R + G + B / 256 - 32768
+    Terrarium,
+    /// R low byte, G high byte, B sign
+    SrtmRgba,
+    /// 16-bit grey, metres
+    Grey16,
+}
+
+/// Unit of heights in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum HeightUnit {
+    /// Metres
+    Metres,
+    /// International feet, 0.3048 m
+    Feet,
+    /// US survey feet, 1200/3937 m
+    UsFeet,
+}
+
+/// `terrafarm terrain synth`
+#[derive(Debug, ClapArgs)]
+pub struct Synth {
+    /// The store to write
+    #[arg(short, long)]
+    pub output: PathBuf,
+    /// Posts along a side
+    #[arg(long, default_value_t = 2049)]
+    pub size: u32,
+    /// Distance between posts, metres
+    #[arg(long, default_value_t = 15.0)]
+    pub spacing: f64,
+    /// Same seed, same terrain
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Photo pixels per post along a side
+    #[arg(long, default_value_t = 1)]
+    pub photo_scale: u32,
+    /// Replace an existing store
+    #[arg(long)]
+    pub force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `terrafarm render`
+#[derive(Debug, ClapArgs)]
+pub struct Render {
+    /// Scene file (TOML), or a .terrain store to render with the default light
+    pub scene: PathBuf,
+    /// Flight: CSV keyframes
+    #[arg(long)]
+    pub flight: PathBuf,
+    /// Where the pictures go: a folder or NAME-%05d.png for PNG, NAME.y4m, NAME.mp4
+    #[arg(short, long)]
+    pub output: PathBuf,
+    /// Size of the picture [default: the scene's, else 1280x720]
+    #[arg(long, value_parser = parse_size, value_name = "WxH")]
+    pub size: Option<(u32, u32)>,
+    /// Frames per second of flight [default: the scene's, else 30]
+    #[arg(long)]
+    pub fps: Option<f64>,
+    /// Render these frames only, such as 0..24 (the end is not included)
+    #[arg(long, value_parser = parse_range, value_name = "FIRST..END")]
+    pub frames: Option<(u32, u32)>,
+    /// How rays find the ground: exact or reference
+    #[arg(long)]
+    pub method: Option<Method>,
+    /// Samples along each side of a pixel: 2 means 4 a pixel
+    #[arg(long)]
+    pub samples: Option<u32>,
+    /// Shape of the jobs: columns, tiles, or tiles:SIDE
+    #[arg(long, value_parser = parse_split, default_value = "columns")]
+    pub split: Split,
+    /// Farm to render on [default: local workers]
+    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
+    pub coordinator: Option<String>,
+    /// Local worker processes, when there is no farm [default: one a core, at most 8]
+    #[arg(long, conflicts_with = "coordinator", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub workers: Option<u32>,
+    /// Threads of each local worker [default: the cores shared out]
+    #[arg(long, conflicts_with = "coordinator", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Frames that may be under way at once [default: 3]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub frames_in_flight: Option<u32>,
+    /// Who encodes MP4
+    #[arg(long, value_enum, default_value_t = Encoder::Builtin)]
+    pub encoder: Encoder,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Who encodes video.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Encoder {
+    /// The encoder that is part of this program
+    Builtin,
+    /// The ffmpeg on PATH
+    Ffmpeg,
+}
+
+/// `terrafarm coordinator`
+#[derive(Debug, ClapArgs)]
+pub struct Coordinator {
+    /// Address to listen on
+    #[arg(long, default_value = "127.0.0.1:7070")]
+    pub listen: SocketAddr,
+    /// Allow links that are neither encrypted nor authenticated beyond this machine
+    #[arg(long)]
+    pub plain: bool,
+    /// Memory for terrain tiles on their way to workers, MiB
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
+    pub blob_memory: u64,
+}
+
+/// `terrafarm worker`
+#[derive(Debug, ClapArgs)]
+pub struct Worker {
+    /// The coordinator to work for
+    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR", default_value = "127.0.0.1:7070")]
+    pub coordinator: String,
+    /// Name shown to people [default: this PC's name]
+    #[arg(long)]
+    pub name: Option<String>,
+    /// Threads to render with [default: all cores]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Folder for terrain tiles [default: the user's cache folder]
+    #[arg(long)]
+    pub cache_dir: Option<PathBuf>,
+    /// Size limit of that folder, MiB; 0 keeps nothing on disk
+    #[arg(long, default_value_t = 4096, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
+    pub cache_limit: u64,
+    /// Memory for decoded tiles, MiB
+    #[arg(long, default_value_t = 1024, value_parser = clap::value_parser!(u64).range(64..=1_048_576))]
+    pub memory_limit: u64,
+    /// End when the coordinator goes away instead of waiting for it
+    #[arg(long)]
+    pub once: bool,
+}
+
+/// `terrafarm simulate`
+#[derive(Debug, ClapArgs)]
+pub struct Simulate {
+    /// Workers
+    #[arg(long, default_value_t = 31, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub workers: u32,
+    /// Frames of the shot [default: about a minute of work]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
+    /// Same seed, same run
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Let workers die, fall silent, come back late and lose messages
+    #[arg(long)]
+    pub faults: bool,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let side = |part: &str| part.parse::<u32>().ok().filter(|n| (1..=16_384).contains(n));
+    text.split_once('x')
+        .and_then(|(width, height)| Some((side(width)?, side(height)?)))
+        .ok_or_else(|| "write WIDTHxHEIGHT in pixels, such as 1280x720, each 1 to 16384".into())
+}
+
+fn parse_range(text: &str) -> Result<(u32, u32), String> {
+    text.split_once("..")
+        .and_then(|(first, end)| Some((first.parse().ok()?, end.parse().ok()?)))
+        .filter(|(first, end)| first < end)
+        .ok_or_else(|| "write FIRST..END with FIRST below END, such as 0..24".into())
+}
+
+fn parse_split(text: &str) -> Result<Split, String> {
+    match text.split_once(':') {
+        None if text == "columns" => Ok(Split::Columns),
+        None if text == "tiles" => Ok(Split::Tiles(128)),
+        Some(("tiles", side)) => match side.parse::<u32>() {
+            Ok(side) if (8..=4096).contains(&side) => Ok(Split::Tiles(side)),
+            _ => Err("a tile has 8 to 4096 pixels a side, such as tiles:128".into()),
+        },
+        _ => Err("choose columns, tiles or tiles:SIDE".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_definition_holds_together() {
+        Args::command().debug_assert();
+    }
+
+    #[test]
+    fn sizes_ranges_and_splits_are_read() {
+        assert_eq!(parse_size("1280x720"), Ok((1280, 720)));
+        assert!(parse_size("0x720").is_err());
+        assert!(parse_size("1e9x2").is_err());
+        assert_eq!(parse_range("3..9"), Ok((3, 9)));
+        assert!(parse_range("9..3").is_err());
+        assert_eq!(parse_split("tiles:64"), Ok(Split::Tiles(64)));
+        assert!(parse_split("tiles:0").is_err());
+        assert!(parse_split("rows").is_err());
+    }
+}

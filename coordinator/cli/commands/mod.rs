@@ -1,0 +1,25 @@
+//! One module a command.
+
+mod demo;
+mod render;
+mod serve;
+mod simulate;
+mod terrain;
+
+use serve::runtime;
+pub use serve::stop_signal;
+
+use crate::Outcome;
+use crate::args::Command;
+
+/// Carries out a command.
+pub fn run(command: Command) -> anyhow::Result<Outcome> {
+    match command {
+        Command::Demo(args) => demo::run(&args),
+        Command::Terrain(args) => terrain::run(args),
+        Command::Render(args) => render::run(&args),
+        Command::Coordinator(args) => serve::coordinator(&args),
+        Command::Worker(args) => serve::worker(args),
+        Command::Simulate(args) => simulate::run(&args),
+    }
+}

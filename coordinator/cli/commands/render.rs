@@ -1,0 +1,106 @@
+//! `terrafarm render`: a scene and a flight become pictures.
+
+use crate::farm::Crew;
+use crate::input::scene::Scene;
+use crate::shot::{self, Choice, FRAMES_IN_FLIGHT, Farm, Plan, Report};
+use crate::{Outcome, args};
+use anyhow::Context;
+use std::path::Path;
+use terrafarm_common::quality::{Method, Quality};
+use terrafarm_coordinator::sink::Encoder;
+
+/// Renders and prints where the result is.
+pub fn run(args: &args::Render) -> anyhow::Result<Outcome> {
+    let plan = plan(args)?;
+    let report = super::runtime()?.block_on(shot::carry_out(plan))?;
+    print(&report, args.json)?;
+    Ok(report.outcome())
+}
+
+fn plan(args: &args::Render) -> anyhow::Result<Plan> {
+    let scene = read_scene(&args.scene)?;
+    let mut quality = scene.quality;
+    if let Some(method) = args.method {
+        quality = Quality { method, samples_per_side: default_samples(method) };
+    }
+    if let Some(samples) = args.samples {
+        quality.samples_per_side = samples;
+    }
+    let choice = Choice {
+        scene: &args.scene,
+        flight: &args.flight,
+        size: args.size.unwrap_or(scene.size),
+        fps: args.fps.unwrap_or(scene.fps),
+        frames: args.frames,
+    };
+    Ok(Plan {
+        name: args.output.display().to_string(),
+        quality,
+        split: args.split,
+        frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
+        output: args.output.clone(),
+        encoder: match args.encoder {
+            args::Encoder::Builtin => Encoder::BuiltIn,
+            args::Encoder::Ffmpeg => Encoder::Ffmpeg,
+        },
+        farm: match &args.coordinator {
+            Some(address) => Farm::Remote(address.clone()),
+            None => Farm::Local(Crew::fill(args.workers, args.threads)),
+        },
+        ..Plan::read(&scene, &choice)?
+    })
+}
+
+/// Samples along a side of a pixel unless the user says otherwise.
+fn default_samples(method: Method) -> u32 {
+    match method {
+        Method::Exact => 1,
+        Method::Reference => 8,
+    }
+}
+
+/// A scene file, or a bare store with the light that a scene has by default.
+fn read_scene(path: &Path) -> anyhow::Result<Scene> {
+    if path.extension().is_some_and(|extension| extension == "terrain") {
+        // What a scene file of this one line would say.
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let line = format!("terrain = {}\n[sun]\n", toml::Value::String(name.into_owned()));
+        return Ok(Scene::parse(path, &line)?);
+    }
+    Ok(Scene::read(path)?)
+}
+
+/// Says what was made, for people or for scripts.
+pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
+    let frames = report.manifest.frames.len();
+    if json {
+        let summary = serde_json::json!({
+            "output": report.finished.output,
+            "manifest": report.manifest_path,
+            "frames": frames,
+            "failed": report.manifest.failed,
+            "bytes": report.finished.bytes,
+            "seconds": report.seconds,
+            "frames_per_s": report.frames_per_s(),
+            "workers": report.manifest.workers.len(),
+        });
+        println!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
+        return Ok(());
+    }
+    let [width, height] = report.manifest.size;
+    println!(
+        "{}: {frames} frames of {width} x {height} in {:.1} s ({:.1} frames/s, {} workers)",
+        report.finished.output.display(),
+        report.seconds,
+        report.frames_per_s(),
+        report.manifest.workers.len(),
+    );
+    println!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());
+    if report.manifest.frames.iter().any(|frame| frame.below_ground) {
+        println!("warning: the camera was below the ground in some frames; see below_ground there");
+    }
+    if !report.manifest.failed.is_empty() {
+        println!("{} frames failed and are shown in magenta", report.manifest.failed.len());
+    }
+    Ok(())
+}

@@ -1,0 +1,55 @@
+//! The terrain of a store as a flight sees it: where a longitude lies, where north is,
+//! how high the ground is.
+
+use crate::input::flight::{Bounds, Place};
+use anyhow::Context;
+use terrafarm_geo::Crs;
+use terrafarm_terrain::info::summary;
+use terrafarm_terrain::sample::height_at;
+use terrafarm_terrain::store::StoreReader;
+
+/// A store and its reference system.
+pub struct StorePlace<'a> {
+    store: &'a StoreReader,
+    crs: Crs,
+    bounds: Bounds,
+}
+
+impl<'a> StorePlace<'a> {
+    /// Reads the reference system of a store.
+    pub fn new(store: &'a StoreReader) -> anyhow::Result<Self> {
+        let crs = Crs::parse(&store.index().crs)
+            .with_context(|| format!("{}: cannot use its reference system", store.path().display()))?;
+        let info = summary(store);
+        Ok(StorePlace { store, crs, bounds: Bounds { min: info.min, max: info.max } })
+    }
+
+    /// Bearing of true north on the grid at the middle of the terrain, degrees.
+    pub fn middle_convergence_deg(&self) -> f64 {
+        let [x, y] = [0, 1].map(|axis| 0.5 * (self.bounds.min[axis] + self.bounds.max[axis]));
+        self.convergence_deg(x, y)
+    }
+}
+
+impl Place for StorePlace<'_> {
+    fn to_grid(&self, lon_deg: f64, lat_deg: f64) -> Result<[f64; 2], String> {
+        self.crs.from_lonlat([lon_deg, lat_deg]).map_err(|why| why.to_string())
+    }
+
+    fn convergence_deg(&self, x: f64, y: f64) -> f64 {
+        if self.crs.is_local() {
+            return 0.0;
+        }
+        // Far outside the system's domain there is no north; such a flight is refused
+        // for lying outside the terrain.
+        self.crs.convergence_deg([x, y]).unwrap_or(0.0)
+    }
+
+    fn ground(&self, x: f64, y: f64) -> Option<f64> {
+        height_at(self.store, x, y).ok().flatten()
+    }
+
+    fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+}

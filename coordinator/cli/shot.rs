@@ -1,0 +1,348 @@
+//! One shot from its plan to its files: what `render` and `demo` have in common.
+
+use crate::Outcome;
+use crate::farm::{Crew, LocalFarm};
+use crate::input::flight;
+use crate::input::scene::Scene;
+use crate::place::StorePlace;
+use crate::progress;
+use anyhow::{Context, anyhow, bail};
+use indicatif::ProgressBar;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{BlobHash, FrameIndex};
+use terrafarm_common::image::Rgb8;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::Shading;
+use terrafarm_coordinator::client::{self, ClientError, FrameFacts, Submission, Update};
+use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
+use terrafarm_film::OrderedFrames;
+use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
+use terrafarm_terrain::store::{StoreReader, hash_of};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+/// Frames under way at once unless the user says otherwise: one being written, one whose
+/// last jobs run, one that has begun.
+pub const FRAMES_IN_FLIGHT: u32 = 3;
+/// Shown instead of a frame that could not be rendered: nobody takes it for terrain.
+const FAILED_FRAME_RGB: [u8; 3] = [255, 0, 255];
+
+/// Everything that is decided before the first ray.
+pub struct Plan {
+    /// What to call it.
+    pub name: String,
+    /// The scene as the user named it, for the manifest.
+    pub scene: PathBuf,
+    /// What stood in it.
+    pub scene_sha256: BlobHash,
+    /// The flight as the user named it, for the manifest.
+    pub flight: PathBuf,
+    /// Its terrain.
+    pub store: Arc<StoreReader>,
+    /// Light, air and sky.
+    pub shading: Shading,
+    /// Method and samples.
+    pub quality: Quality,
+    /// How frames are cut into jobs.
+    pub split: Split,
+    /// Index of the first camera within the flight.
+    pub first_frame: FrameIndex,
+    /// One camera a frame, all of one size.
+    pub cameras: Vec<Camera>,
+    /// Frames per second.
+    pub fps: f64,
+    /// Frames that may be under way at once.
+    pub frames_in_flight: u32,
+    /// Where the pictures go.
+    pub output: PathBuf,
+    /// Who compresses video.
+    pub encoder: Encoder,
+    /// A frame to be kept as a picture of its own.
+    pub poster: Option<(FrameIndex, PathBuf)>,
+    /// Who renders.
+    pub farm: Farm,
+}
+
+/// What is chosen for a flight over a scene.
+pub struct Choice<'a> {
+    /// The scene file.
+    pub scene: &'a Path,
+    /// The flight file.
+    pub flight: &'a Path,
+    /// Size of the picture, pixels.
+    pub size: (u32, u32),
+    /// Frames per second.
+    pub fps: f64,
+    /// Frames to render, the end not included; all if `None`.
+    pub frames: Option<(FrameIndex, FrameIndex)>,
+}
+
+impl Plan {
+    /// Opens the terrain of a scene and turns a flight into cameras: local workers, PNG
+    /// pictures in the current folder, to be changed by the caller.
+    pub fn read(scene: &Scene, choice: &Choice) -> anyhow::Result<Plan> {
+        let store = StoreReader::open(&scene.terrain)
+            .with_context(|| format!("cannot use the terrain of {}", choice.scene.display()))?;
+        let place = StorePlace::new(&store)?;
+        let file = flight::read(choice.flight, &place, scene.hfov_deg)?;
+        for warning in &file.warnings {
+            eprintln!("terrafarm: warning: {warning}");
+        }
+        let times = file.flight.frame_times(choice.fps)?;
+        let total = times.len() as u32;
+        let (first, end) = choice.frames.unwrap_or((0, total));
+        if first >= total {
+            bail!("--frames {first}..{end}: the flight has {total} frames at {} a second", choice.fps);
+        }
+        let cameras = times
+            .skip(first as usize)
+            .take((end.min(total) - first) as usize)
+            .map(|t| file.flight.pose_at(t).camera(choice.size))
+            .collect();
+        let shading = scene
+            .shading(store.index().earth_radius_m, place.middle_convergence_deg())
+            .map_err(|why| anyhow!("{}: {why}", choice.scene.display()))?;
+        // A store that stands for a scene has an identity already, and may be large.
+        let scene_sha256 = if choice.scene == scene.terrain {
+            store.index_blob().0
+        } else {
+            let bytes = std::fs::read(choice.scene);
+            hash_of(&bytes.with_context(|| format!("cannot read {}", choice.scene.display()))?)
+        };
+        Ok(Plan {
+            name: choice.scene.display().to_string(),
+            scene: choice.scene.to_owned(),
+            scene_sha256,
+            flight: choice.flight.to_owned(),
+            shading,
+            quality: scene.quality,
+            split: Split::Columns,
+            first_frame: first,
+            cameras,
+            fps: choice.fps,
+            frames_in_flight: FRAMES_IN_FLIGHT,
+            output: PathBuf::from("."),
+            encoder: Encoder::BuiltIn,
+            poster: None,
+            farm: Farm::Local(Crew::fill(None, None)),
+            store: Arc::new(store),
+        })
+    }
+}
+
+/// Who renders.
+pub enum Farm {
+    /// Worker processes on this PC.
+    Local(Crew),
+    /// A coordinator somewhere.
+    Remote(String),
+}
+
+/// What became of a shot.
+pub struct Report {
+    /// What was written.
+    pub finished: Finished,
+    /// The manifest beside it.
+    pub manifest_path: PathBuf,
+    /// Its content.
+    pub manifest: Manifest,
+    /// Wall time, seconds.
+    pub seconds: f64,
+}
+
+impl Report {
+    /// Whether every frame was rendered.
+    pub fn outcome(&self) -> Outcome {
+        if self.manifest.failed.is_empty() { Outcome::Done } else { Outcome::FailedFrames }
+    }
+
+    /// Frames per second of wall time.
+    pub fn frames_per_s(&self) -> f64 {
+        self.manifest.frames.len() as f64 / self.seconds.max(1e-9)
+    }
+}
+
+/// Renders a plan. Ctrl-C stops it; finished pictures of a sequence are kept.
+pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
+    let started = Instant::now();
+    let camera = plan.cameras.first().ok_or_else(|| anyhow!("the flight has no frame"))?;
+    let spec = Spec {
+        width: camera.width,
+        height: camera.height,
+        fps: plan.fps,
+        first: plan.first_frame,
+        frames: plan.cameras.len() as u32,
+    };
+    // Before anything is rendered: an output that cannot be written is no reason to wait.
+    let sink = sink::open(&plan.output, spec, plan.encoder)?;
+    let farm = match &plan.farm {
+        Farm::Local(crew) => Some(LocalFarm::start(*crew).await?),
+        Farm::Remote(_) => None,
+    };
+    let address = match (&plan.farm, &farm) {
+        (Farm::Remote(address), _) => address.clone(),
+        (Farm::Local(_), Some(farm)) => farm.address.to_string(),
+        (Farm::Local(_), None) => unreachable!("a local farm was started above"),
+    };
+    let stop = CancellationToken::new();
+    let interrupt = tokio::spawn({
+        let stop = stop.clone();
+        async move {
+            crate::commands::stop_signal().await;
+            stop.cancel();
+        }
+    });
+
+    let in_flight = plan.frames_in_flight as usize;
+    let (updates, inbox) = mpsc::channel(2 * in_flight + 8);
+    let (taken, taken_out) = mpsc::channel(in_flight + 8);
+    let bar = progress::bar("frames", u64::from(spec.frames));
+    let desk = Desk { spec, first: plan.first_frame, poster: plan.poster.clone(), bar: bar.clone() };
+    let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
+    let submission = Submission {
+        name: plan.name.clone(),
+        store: plan.store.clone(),
+        shading: plan.shading.clone(),
+        quality: plan.quality,
+        split: plan.split,
+        cameras: plan.cameras.clone(),
+        frames_in_flight: plan.frames_in_flight,
+    };
+    let rendered = client::render(&address, submission, updates, taken_out, stop).await;
+    interrupt.abort();
+    if let Some(farm) = farm {
+        farm.stop().await;
+    }
+    let written = writing.await.context("the task that writes frames ended early")?;
+    bar.finish_and_clear();
+    // What went wrong with a file is the cause; that the shot then stopped is not.
+    let Written { finished, records, failed } = match (written, &rendered) {
+        (Ok(written), _) => written,
+        (Err(why), Ok(_) | Err(ClientError::Stopped)) => return Err(why),
+        (Err(_), Err(_)) => Written::default(),
+    };
+    let done = rendered?;
+    let finished = finished.ok_or_else(|| anyhow!("the output was not finished"))?;
+    let manifest = Manifest {
+        program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),
+        scene: plan.scene.display().to_string(),
+        scene_sha256: plan.scene_sha256.to_hex(),
+        terrain: plan.store.path().display().to_string(),
+        terrain_sha256: plan.store.index_blob().0.to_hex(),
+        flight: Some(plan.flight.display().to_string()),
+        output: finished.output.display().to_string(),
+        method: plan.quality.method.name().to_owned(),
+        samples: plan.quality.samples_per_side,
+        tolerance_px: None,
+        size: [spec.width, spec.height],
+        fps: plan.fps,
+        frames: records,
+        failed,
+        workers: done
+            .workers
+            .iter()
+            .map(|share| WorkerEntry {
+                name: share.name.clone(),
+                jobs: share.jobs,
+                render_ms: share.cost_us as f64 / 1e3,
+            })
+            .collect(),
+    };
+    let manifest_path = manifest.save(&finished.output)?;
+    Ok(Report { finished, manifest_path, manifest, seconds: started.elapsed().as_secs_f64() })
+}
+
+/// Puts frames in order and into the sink.
+struct Desk {
+    spec: Spec,
+    first: FrameIndex,
+    poster: Option<(FrameIndex, PathBuf)>,
+    bar: ProgressBar,
+}
+
+#[derive(Default)]
+struct Written {
+    finished: Option<Finished>,
+    records: Vec<FrameEntry>,
+    failed: BTreeMap<FrameIndex, String>,
+}
+
+impl Desk {
+    fn write(
+        self,
+        mut sink: Box<dyn FrameSink>,
+        mut inbox: mpsc::Receiver<Update>,
+        taken: &mpsc::Sender<FrameIndex>,
+    ) -> anyhow::Result<Written> {
+        let mut order = OrderedFrames::new(self.spec.frames as usize);
+        let mut written = Written::default();
+        while let Some(update) = inbox.blocking_recv() {
+            match update {
+                Update::Progress(progress) => {
+                    self.bar.set_message(format!("on {} workers", progress.workers));
+                }
+                Update::Frame(index, picture, facts) => order.put(index, Some((picture, facts)))?,
+                Update::FrameFailed(index, reason) => {
+                    let number = self.first + index;
+                    self.bar.suspend(|| eprintln!("frame {number} failed: {reason}"));
+                    written.failed.insert(number, reason);
+                    order.put(index, None)?;
+                }
+            }
+            while let Some((index, frame)) = order.take() {
+                self.put(sink.as_mut(), index, frame, &mut written)?;
+                // The shot may be over by now; then nobody needs to know.
+                let _ = taken.blocking_send(index);
+                self.bar.inc(1);
+            }
+        }
+        if order.next() == self.spec.frames {
+            self.bar.set_message("finishing the file");
+            written.finished = Some(sink.finish()?);
+        }
+        Ok(written)
+    }
+
+    fn put(
+        &self,
+        sink: &mut dyn FrameSink,
+        index: FrameIndex,
+        frame: Option<(Rgb8, FrameFacts)>,
+        written: &mut Written,
+    ) -> anyhow::Result<()> {
+        let Some((picture, facts)) = frame else {
+            sink.put(index, &marked(self.spec.width, self.spec.height))?;
+            return Ok(());
+        };
+        sink.put(index, &picture)?;
+        if let Some((poster, path)) = &self.poster
+            && *poster == index
+        {
+            sink::poster::save(path, &picture)?;
+        }
+        written.records.push(FrameEntry {
+            index: self.first + index,
+            sha256: sink::pixels_sha256(&picture).to_hex(),
+            ms: facts.elapsed_us as f64 / 1e3,
+            render_ms: facts.cost_us as f64 / 1e3,
+            jobs: facts.jobs,
+            below_ground: facts.below_ground,
+            error_px_p99: None,
+            mismatch: None,
+        });
+        Ok(())
+    }
+}
+
+fn marked(width: u32, height: u32) -> Rgb8 {
+    let mut picture = Rgb8::new(width, height);
+    for pixel in picture.pixels_mut().chunks_exact_mut(3) {
+        pixel.copy_from_slice(&FAILED_FRAME_RGB);
+    }
+    picture
+}

@@ -1,0 +1,303 @@
+//! What can happen, and what the scheduler may ask for.
+
+use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
+use terrafarm_common::region::{Region, Split};
+
+/// A time: microseconds since any fixed moment, the same for all events of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub struct Micros(pub u64);
+
+impl Micros {
+    /// This many microseconds later.
+    #[must_use]
+    pub fn after(self, us: u64) -> Micros {
+        Micros(self.0.saturating_add(us))
+    }
+
+    /// Microseconds since an earlier time; 0 if it is not earlier.
+    pub fn since(self, earlier: Micros) -> u64 {
+        self.0.saturating_sub(earlier.0)
+    }
+}
+
+/// Something that happened. Events about a worker or a shot that is not known, or no
+/// longer, change nothing; a result from one is refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Event {
+    /// When a worker has finished its handshake. A second join of the same worker
+    /// changes nothing.
+    WorkerJoined {
+        /// A connection that has not been used before.
+        worker: WorkerId,
+        /// Threads it renders with: the first guess of its speed.
+        threads: u32,
+    },
+    /// When a connection has ended. What the worker held is granted anew at once.
+    WorkerLost {
+        /// The connection that ended.
+        worker: WorkerId,
+        /// How it ended; it does not change what happens next.
+        why: LostReason,
+    },
+    /// When a worker wants to leave: it gets no new job and may finish those it has.
+    WorkerDraining {
+        /// The one that wants to leave.
+        worker: WorkerId,
+    },
+    /// When a worker gives jobs back without having failed at them.
+    HandedBack {
+        /// The one that held them.
+        worker: WorkerId,
+        /// What it gives back. Leases it does not hold are passed over.
+        leases: Vec<LeaseId>,
+    },
+    /// When a client asks for a shot. Answered by [`Action::ShotFailed`] if it breaks a
+    /// limit; a number that is in use already is passed over.
+    ShotSubmitted {
+        /// A number that has not been used before.
+        shot: ShotId,
+        /// Number of frames, 1 to [`crate::MAX_FRAMES`].
+        frames: u32,
+        /// Width of every frame, pixels.
+        width: u32,
+        /// Height of every frame, pixels.
+        height: u32,
+        /// The shape of its jobs.
+        split: Split,
+        /// Shots of a higher priority get every worker they can use; equals take turns.
+        priority: i32,
+        /// Frames open or finished but not yet taken, 1 to
+        /// [`crate::MAX_FRAMES_IN_FLIGHT`]: the bound on the coordinator's memory.
+        frames_in_flight: u32,
+    },
+    /// When pixels of the right number have arrived. Answered by [`Action::Accept`] or
+    /// [`Action::Refuse`] before any other action.
+    JobDone {
+        /// Who sent them.
+        worker: WorkerId,
+        /// The lease they came under.
+        lease: LeaseId,
+        /// How long the worker says it rendered, microseconds.
+        cost_us: u64,
+    },
+    /// When a worker could not render a job, or sent pixels that cannot be right.
+    JobFailed {
+        /// Who failed.
+        worker: WorkerId,
+        /// The lease it failed under.
+        lease: LeaseId,
+        /// Why, in words for the user.
+        reason: String,
+    },
+    /// When a finished frame has left the coordinator's memory.
+    FrameTaken {
+        /// Its shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+    },
+    /// When a shot is no longer wanted. Its jobs are revoked at once; nothing more is
+    /// said about it.
+    ShotCanceled {
+        /// The one that is not wanted.
+        shot: ShotId,
+    },
+    /// When any bytes have come from a worker. The other events from workers imply it.
+    HeardFrom {
+        /// The one that lives.
+        worker: WorkerId,
+    },
+    /// When the time of [`crate::Scheduler::next_deadline`] has come, or at any time.
+    Tick,
+}
+
+/// Something to be done, in the order given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Action {
+    /// Send a job. A worker runs its jobs in the order of their grants.
+    Grant {
+        /// To whom.
+        worker: WorkerId,
+        /// The number under which the result is awaited, larger than all before.
+        lease: LeaseId,
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// The pixels.
+        region: Region,
+    },
+    /// Tell a worker that a job is not wanted any more. It may be done already.
+    Revoke {
+        /// The one that holds it.
+        worker: WorkerId,
+        /// The lease that has ended.
+        lease: LeaseId,
+    },
+    /// Merge the pixels of the [`Event::JobDone`] being handled.
+    Accept {
+        /// The lease.
+        lease: LeaseId,
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// Where they belong.
+        region: Region,
+    },
+    /// Throw the pixels of the [`Event::JobDone`] being handled away.
+    Refuse {
+        /// Who sent them.
+        worker: WorkerId,
+        /// The lease they came under.
+        lease: LeaseId,
+        /// Why.
+        why: RefuseReason,
+    },
+    /// All pixels of a frame are there. Answer with [`Event::FrameTaken`].
+    FrameComplete {
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+    },
+    /// A frame cannot be rendered; throw away what is there. The shot goes on, and the
+    /// frame does not have to be taken.
+    FrameFailed {
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// Why.
+        reason: FrameFailure,
+    },
+    /// Every frame is complete or has failed: the last word on a shot.
+    ShotComplete {
+        /// The shot.
+        shot: ShotId,
+        /// How many of its frames failed.
+        failed_frames: u32,
+    },
+    /// The shot is not begun or not continued: the last word on it. Frames of it that are
+    /// not complete are thrown away.
+    ShotFailed {
+        /// The shot.
+        shot: ShotId,
+        /// Why.
+        reason: ShotFailure,
+    },
+    /// Send something that the worker answers.
+    Probe {
+        /// To whom.
+        worker: WorkerId,
+    },
+    /// Close the connection; the scheduler has forgotten the worker.
+    Drop {
+        /// Whose.
+        worker: WorkerId,
+        /// Why.
+        why: DropReason,
+    },
+    /// A worker failed at several jobs of a shot that others may manage, and gets no more
+    /// of them. For the log.
+    Blocked {
+        /// The worker.
+        worker: WorkerId,
+        /// The shot.
+        shot: ShotId,
+    },
+    /// A worker gets jobs of that shot again, since the others are gone or do no better.
+    /// For the log.
+    Unblocked {
+        /// The worker.
+        worker: WorkerId,
+        /// The shot.
+        shot: ShotId,
+    },
+}
+
+/// How a connection ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LostReason {
+    /// The worker said that it leaves.
+    Left,
+    /// The connection broke.
+    Broken,
+    /// The worker broke the protocol, and the coordinator closed.
+    Misbehaved,
+}
+
+/// Why pixels are thrown away. All three are part of normal work.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RefuseReason {
+    /// The lease has ended: it expired, or the job was revoked or granted to another.
+    Stale,
+    /// The lease was never granted, or is held by another worker.
+    Unknown,
+    /// A result under this lease was accepted a short while ago.
+    Duplicate,
+}
+
+/// Why a worker is dropped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum DropReason {
+    /// When no byte came for [`crate::Config::silence_us`].
+    #[error("silent for {silence_us} us, probes unanswered; is the machine asleep or unplugged?")]
+    Silent {
+        /// How long, microseconds.
+        silence_us: u64,
+    },
+    /// When [`crate::MAX_WORKERS`] are connected.
+    #[error(
+        "the farm is full: {} workers are connected; stop one to make room",
+        crate::MAX_WORKERS
+    )]
+    FarmFull,
+}
+
+/// Why a frame failed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FrameFailure {
+    /// When one of its jobs failed too often.
+    #[error("{} x {} pixels at ({}, {}) failed {tries} times, at last on {worker}: {reason}",
+        region.width, region.height, region.x, region.y)]
+    JobFailed {
+        /// The job.
+        region: Region,
+        /// How often it was tried.
+        tries: usize,
+        /// Who tried last.
+        worker: WorkerId,
+        /// What the last worker said.
+        reason: String,
+    },
+}
+
+/// Why a shot failed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ShotFailure {
+    /// When [`crate::MAX_SHOTS`] are queued.
+    #[error(
+        "the queue is full: {} shots wait; submit again when one has finished",
+        crate::MAX_SHOTS
+    )]
+    QueueFull,
+    /// When a number of the shot is 0 or too large.
+    #[error("{what} is {value}; choose 1 to {limit}")]
+    OutOfRange {
+        /// Which number.
+        what: &'static str,
+        /// What it is.
+        value: u64,
+        /// Its largest value.
+        limit: u64,
+    },
+    /// When not one frame was finished before so many had failed.
+    #[error("none of its first {failed_frames} frames could be rendered; the last one: {last}")]
+    NothingRenders {
+        /// How many failed.
+        failed_frames: u32,
+        /// Why the last one failed.
+        last: FrameFailure,
+    },
+}

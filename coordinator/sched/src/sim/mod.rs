@@ -1,0 +1,153 @@
+//! The real scheduler on a virtual clock: workers, links and faults are made up, every
+//! decision is not.
+//!
+//! A run is a discrete-event simulation: one queue, ordered by time, then by insertion.
+//! It depends on its [`SimConfig`] alone, so that a bad night can be played again from
+//! its seed. A judge that knows nothing of the scheduler's insides watches every event
+//! and action and counts what must not happen ([`Violations`]).
+
+mod fault;
+mod field;
+mod judge;
+mod machine;
+mod world;
+
+pub use fault::Faults;
+pub use judge::Violations;
+
+use crate::config::Config;
+use crate::scheduler::Account;
+use serde::Serialize;
+use terrafarm_common::region::Split;
+
+/// What is simulated.
+#[derive(Debug, Clone)]
+pub struct SimConfig {
+    /// Number of workers.
+    pub workers: u32,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Shots, submitted together, all alike; every second one has a higher priority.
+    pub shots: u32,
+    /// Frames of each shot.
+    pub frames: u32,
+    /// Width of the frames, pixels.
+    pub width: u32,
+    /// Height of the frames, pixels.
+    pub height: u32,
+    /// Shape of the jobs.
+    pub split: Split,
+    /// Bound on the frames in the coordinator's memory, for each shot.
+    pub frames_in_flight: u32,
+    /// What a frame takes a worker of speed 1, on average, seconds.
+    pub frame_work_s: f64,
+    /// How uneven the columns of a frame are: the costliest take about `1 + skew` times
+    /// as long as the cheapest.
+    pub skew: f64,
+    /// Slowest and fastest worker; speeds are spread evenly over the ratio between them.
+    pub speeds: (f64, f64),
+    /// Shortest and longest one-way delay of the links, microseconds.
+    pub latency_us: (u64, u64),
+    /// Bytes that a worker's link carries in a microsecond: 118 is Gigabit Ethernet.
+    pub link_bytes_per_us: f64,
+    /// The same for the coordinator's link, which all workers share.
+    pub hub_bytes_per_us: f64,
+    /// Size of a result, bytes a pixel.
+    pub bytes_per_px: f64,
+    /// What goes wrong.
+    pub faults: Faults,
+    /// Settings of the scheduler.
+    pub scheduler: Config,
+    /// The scheduler's own check runs after every so many events; 0 for never (it is
+    /// slow).
+    pub check_every: u64,
+}
+
+impl Default for SimConfig {
+    fn default() -> Self {
+        SimConfig {
+            workers: 31,
+            seed: 1,
+            shots: 1,
+            frames: 600,
+            width: 1920,
+            height: 1080,
+            split: Split::Columns,
+            frames_in_flight: 16,
+            frame_work_s: 4.0,
+            skew: 4.0,
+            speeds: (0.5, 4.0),
+            latency_us: (100, 1000),
+            link_bytes_per_us: 118.0,
+            hub_bytes_per_us: 1180.0,
+            bytes_per_px: 1.5,
+            faults: Faults::default(),
+            scheduler: Config::default(),
+            check_every: 0,
+        }
+    }
+}
+
+impl SimConfig {
+    /// A farm of this size with enough to do for it: about a minute of fault-free work,
+    /// and as many frames in flight as its workers need.
+    pub fn for_workers(workers: u32, seed: u64) -> Self {
+        let base = SimConfig::default();
+        let frame_work_s = base.frame_work_s.max(f64::from(workers) / 50.0);
+        let speed = 1.68 * f64::from(workers.max(1));
+        SimConfig {
+            workers,
+            seed,
+            frames: (60.0 * speed / frame_work_s).ceil() as u32,
+            frame_work_s,
+            frames_in_flight: base.frames_in_flight.max(workers / 10),
+            ..base
+        }
+    }
+}
+
+/// How a run went.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SimReport {
+    /// Number of workers.
+    pub workers: u32,
+    /// The seed.
+    pub seed: u64,
+    /// Work that was asked for over the work that the workers could have done while they
+    /// were there: the ideal time over the makespan.
+    pub efficiency: f64,
+    /// From the first submission to the last frame, virtual seconds.
+    pub makespan_s: f64,
+    /// Leases granted.
+    pub jobs: u64,
+    /// Frames complete.
+    pub frames: u64,
+    /// Frames that failed with a reason.
+    pub failed_frames: u64,
+    /// Rendering time thrown away over all rendering time.
+    pub redo_share: f64,
+    /// Where the workers' time went.
+    pub time: TimeShares,
+    /// What became of the leases.
+    pub account: Account,
+    /// What must not happen, and did: all zero.
+    pub invariants: Violations,
+    /// The first violation in words.
+    pub first_violation: Option<String>,
+}
+
+/// Where the time of the workers that were there went; weighted by speed, adds up to 1.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct TimeShares {
+    /// Rendering what was merged.
+    pub useful: f64,
+    /// Rendering what was thrown away.
+    pub redone: f64,
+    /// Waiting for a job, or hanging.
+    pub waiting: f64,
+}
+
+/// Plays one run.
+pub fn simulate(config: &SimConfig) -> SimReport {
+    world::World::new(config).run()
+}

@@ -1,0 +1,139 @@
+//! The scheduler on a virtual clock: how well it uses a farm, and that no fault order
+//! makes it lose, repeat or tear a frame.
+
+use terrafarm_common::region::Split;
+use terrafarm_sched::sim::{Faults, SimConfig, SimReport, simulate};
+
+fn run(config: &SimConfig) -> SimReport {
+    let report = simulate(config);
+    println!(
+        "{:4} workers, seed {}: efficiency {:.4}, {:.1} s, {} frames, {} jobs, redo {:.4}, {:?} {:?}",
+        report.workers,
+        report.seed,
+        report.efficiency,
+        report.makespan_s,
+        report.frames,
+        report.jobs,
+        report.redo_share,
+        report.time,
+        report.account,
+    );
+    assert!(report.invariants.is_clean(), "{:?} {:?}", report.invariants, report.first_violation);
+    report
+}
+
+#[test]
+fn thirty_one_mixed_workers_are_used_to_98_percent() {
+    for seed in 1..=5 {
+        let report = run(&SimConfig::for_workers(31, seed));
+        assert!(report.efficiency >= 0.98, "{report:?}");
+    }
+}
+
+#[test]
+fn a_thousand_mixed_workers_are_used_to_95_percent() {
+    let report = run(&SimConfig::for_workers(1000, 1));
+    assert!(report.efficiency >= 0.95, "{report:?}");
+}
+
+/// A small farm in which a random mixture of everything goes wrong.
+fn bad_night(seed: u64, deadly: bool) -> SimConfig {
+    // Any odd multiplier spreads neighbouring seeds over the choices below.
+    let spread = |choices: u64| (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 33) % choices;
+    let splits = [Split::Columns, Split::Tiles(32), Split::Tiles(50), Split::Columns];
+    SimConfig {
+        workers: 1 + spread(12) as u32,
+        seed,
+        shots: 1 + spread(3) as u32,
+        frames: 1 + spread(17) as u32,
+        width: 100 + spread(97) as u32,
+        height: 64,
+        split: splits[spread(4) as usize],
+        frames_in_flight: 1 + spread(5) as u32,
+        frame_work_s: 2.0,
+        link_bytes_per_us: 0.5,
+        faults: Faults::random(seed, 20.0, deadly),
+        check_every: 16,
+        ..SimConfig::default()
+    }
+}
+
+/// Seeds of the fault schedules: 1500 unless `TERRAFARM_FAULT_SEEDS` names another number.
+fn seeds() -> u64 {
+    let wanted = std::env::var("TERRAFARM_FAULT_SEEDS").ok();
+    wanted.map_or(1500, |text| text.parse().expect("TERRAFARM_FAULT_SEEDS is a number"))
+}
+
+#[test]
+fn under_any_fault_schedule_every_frame_completes_exactly_once() {
+    let (mut refused, mut expired, mut lost, mut hedged) = (0, 0, 0, 0);
+    for seed in 0..seeds() {
+        let config = bad_night(seed, false);
+        let report = simulate(&config);
+        let clean = report.invariants.is_clean() && report.failed_frames == 0;
+        let wanted = u64::from(config.frames) * u64::from(config.shots);
+        assert!(clean && report.frames == wanted, "{config:?} {report:?}");
+        refused += report.account.refused;
+        expired += report.account.expired;
+        lost += report.account.lost;
+        hedged += report.account.hedged;
+    }
+    println!("refused {refused}, expired {expired}, lost {lost}, hedged {hedged}");
+    // Otherwise the schedules would not test what they are for.
+    assert!(refused > 100 && expired > 100 && lost > 100 && hedged > 100);
+}
+
+#[test]
+fn when_jobs_fail_every_frame_completes_or_fails_by_name() {
+    let (mut failed_jobs, mut failed_frames) = (0, 0);
+    for seed in 0..seeds() / 3 {
+        let config = bad_night(seed, true);
+        let report = simulate(&config);
+        let over = report.frames + report.failed_frames;
+        let wanted = u64::from(config.frames) * u64::from(config.shots);
+        assert!(report.invariants.is_clean() && over == wanted, "{config:?} {report:?}");
+        assert!(report.account.failed >= 3 * report.failed_frames);
+        failed_jobs += report.account.failed;
+        failed_frames += report.failed_frames;
+    }
+    println!("failed jobs {failed_jobs}, failed frames {failed_frames}");
+    assert!(failed_jobs > 100);
+}
+
+#[test]
+fn the_same_seed_gives_the_same_run() {
+    for seed in [3, 14, 15] {
+        let config = bad_night(seed, true);
+        assert_eq!(simulate(&config), simulate(&config));
+    }
+    let other = SimConfig { seed: 92, ..bad_night(3, true) };
+    assert_ne!(simulate(&other).makespan_s, simulate(&bad_night(3, true)).makespan_s);
+}
+
+#[test]
+fn deaths_in_the_middle_cost_little_more_than_their_share() {
+    let faults = Faults {
+        within_s: 60.0,
+        crashes: 0.3,
+        power_cuts: 0.2,
+        come_back: true,
+        ..Faults::default()
+    };
+    let report = run(&SimConfig { faults, ..SimConfig::for_workers(31, 4) });
+    assert!(report.account.lost > 0);
+    assert!(report.efficiency >= 0.95, "{report:?}");
+}
+
+#[test]
+fn fixed_tiles_use_the_farm_as_well() {
+    let report = run(&SimConfig { split: Split::Tiles(64), ..SimConfig::for_workers(31, 2) });
+    assert!(report.efficiency >= 0.97, "{report:?}");
+}
+
+#[test]
+fn without_frame_overlap_the_farm_idles_at_the_end_of_every_frame() {
+    let overlapped = SimConfig { frames: 100, ..SimConfig::for_workers(31, 2) };
+    let alone = SimConfig { frames_in_flight: 1, ..overlapped.clone() };
+    let (overlapped, alone) = (run(&overlapped), run(&alone));
+    assert!(overlapped.efficiency > alone.efficiency + 0.05, "{overlapped:?} {alone:?}");
+}

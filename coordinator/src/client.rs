@@ -1,0 +1,318 @@
+//! The side that submits: sends a shot, supplies its terrain by hash, takes its frames.
+
+use bytes::Bytes;
+use std::sync::Arc;
+use std::time::Duration;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
+use terrafarm_common::image::Rgb8;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::Shading;
+use terrafarm_terrain::store::StoreReader;
+use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
+use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox};
+use terrafarm_wire::message::{
+    Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
+    Progress, Role, ShotDone, Submit, WantBlobs,
+};
+use tokio::net::TcpStream;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+/// How long connecting and greeting may take.
+const GREETING_LIMIT: Duration = Duration::from_secs(5);
+/// Messages that may wait for the coordinator on each lane.
+const URGENT_QUEUE: usize = 256;
+/// Blobs that may wait: a few megabytes.
+const BULK_QUEUE: usize = 16;
+/// Questions for blobs that may wait; further ones wait in the socket.
+const WANTS_QUEUE: usize = 64;
+/// The number of the only shot on a connection.
+const NUMBER: u32 = 1;
+
+/// What is to be rendered.
+pub struct Submission {
+    /// What to call it.
+    pub name: String,
+    /// Its terrain.
+    pub store: Arc<StoreReader>,
+    /// Light, air and sky.
+    pub shading: Shading,
+    /// Method and samples.
+    pub quality: Quality,
+    /// How frames are cut into jobs.
+    pub split: Split,
+    /// One camera a frame, all of one size; at least one.
+    pub cameras: Vec<Camera>,
+    /// Frames that may be begun and not yet taken.
+    pub frames_in_flight: u32,
+}
+
+/// What comes back while a shot is rendered.
+#[derive(Debug)]
+pub enum Update {
+    /// A finished frame; answer with its index on the `taken` channel when it is stored.
+    Frame(FrameIndex, Rgb8, FrameFacts),
+    /// A frame that could not be made, and why.
+    FrameFailed(FrameIndex, String),
+    /// How far it is.
+    Progress(Progress),
+}
+
+/// What a frame took.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameFacts {
+    /// Number of jobs it was made of.
+    pub jobs: u32,
+    /// Time that workers rendered, all jobs together, microseconds.
+    pub cost_us: u64,
+    /// From the first grant to the last pixels, microseconds.
+    pub elapsed_us: u64,
+    /// Whether the camera was below the ground.
+    pub below_ground: bool,
+}
+
+/// Why a shot did not come to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// Nobody answers.
+    #[error(
+        "cannot reach coordinator {address}: {source}; is \"terrafarm coordinator\" running there, \
+         and the port open?"
+    )]
+    Connect {
+        /// Where.
+        address: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Somebody answers, but not as a coordinator.
+    #[error("coordinator {address}: {source}")]
+    Handshake {
+        /// Where.
+        address: String,
+        /// What went wrong.
+        source: HandshakeError,
+    },
+    /// The connection was lost.
+    #[error("the coordinator was lost: {0}; frames that were written are kept")]
+    Link(#[from] LinkError),
+    /// The farm does not take the shot, or gave it up.
+    #[error("the farm refused the shot: {0}")]
+    Refused(String),
+    /// The user stopped it.
+    #[error("stopped")]
+    Stopped,
+}
+
+/// Submits a shot and carries it to its end. Frames arrive in any order on `updates`; each
+/// has to be answered on `taken`, else no further ones come.
+///
+/// # Errors
+/// If there is no coordinator, it refuses, it is lost, or `stop` is cancelled.
+pub async fn render(
+    address: &str,
+    submission: Submission,
+    updates: mpsc::Sender<Update>,
+    mut taken: mpsc::Receiver<FrameIndex>,
+    stop: CancellationToken,
+) -> Result<ShotDone, ClientError> {
+    let connect = tokio::time::timeout(GREETING_LIMIT, TcpStream::connect(address));
+    let stream = match connect.await {
+        Ok(Ok(stream)) => stream,
+        Ok(Err(source)) => return Err(ClientError::Connect { address: address.into(), source }),
+        Err(_) => {
+            let source = std::io::Error::from(std::io::ErrorKind::TimedOut);
+            return Err(ClientError::Connect { address: address.into(), source });
+        }
+    };
+    let _ = stream.set_nodelay(true);
+    let hello = Hello::new(&submission.name, Role::Client);
+    let (connection, welcome) = link::greet(stream, hello, GREETING_LIMIT)
+        .await
+        .map_err(|source| ClientError::Handshake { address: address.into(), source })?;
+    let silence = Duration::from_micros(welcome.silence_us);
+    let (mut reader, writer) = connection.split();
+    let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
+    let writing = tokio::spawn(writer.run(queues));
+    let (wants, wanted) = mpsc::channel(WANTS_QUEUE);
+    let serving = tokio::spawn(serve_blobs(submission.store.clone(), wanted, outbox.clone()));
+    let submitting = tokio::spawn(send_submission(submission.clone_plan(), outbox.clone()));
+
+    let mut shot = Talk::new(&submission);
+    let mut heartbeat = tokio::time::interval(Duration::from_micros(welcome.heartbeat_us));
+    let result = loop {
+        if let Some(done) = shot.finished() {
+            break Ok(done);
+        }
+        tokio::select! {
+            () = stop.cancelled() => {
+                if let Some(shot) = shot.id {
+                    let _ = outbox.send(Cancel { shot }).await;
+                }
+                break Err(ClientError::Stopped);
+            }
+            Some(frame) = taken.recv() => {
+                if let Some(shot) = shot.id {
+                    outbox.send(FrameTaken { shot, frame }).await?;
+                }
+            }
+            _ = heartbeat.tick() => outbox.send(Ping { number: 0 }).await?,
+            received = reader.recv_within(silence) => match received {
+                Ok(Some(Message::WantBlobs(want))) => {
+                    let _ = wants.send(want).await;
+                }
+                Ok(Some(Message::Ping(ping))) => {
+                    outbox.send(Pong { number: ping.number }).await?;
+                }
+                Ok(Some(message)) => match shot.hear(message) {
+                    Ok(Some(update)) => {
+                        // The receiver ends first only when writing failed.
+                        if updates.send(update).await.is_err() {
+                            break Err(ClientError::Stopped);
+                        }
+                    }
+                    Ok(None) => {}
+                    Err(why) => break Err(why),
+                },
+                Ok(None) => break Err(LinkError::Closed.into()),
+                Err(why) => break Err(why.into()),
+            },
+        }
+    };
+    let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
+    submitting.abort();
+    serving.abort();
+    drop(outbox);
+    let _ = tokio::time::timeout(GREETING_LIMIT, writing).await;
+    result
+}
+
+/// What is known of the shot on this side.
+struct Talk {
+    id: Option<ShotId>,
+    size: (u32, u32),
+    frames: u64,
+    seen: u64,
+    done: Option<ShotDone>,
+}
+
+impl Talk {
+    fn new(submission: &Submission) -> Self {
+        let size =
+            submission.cameras.first().map_or((0, 0), |camera| (camera.width, camera.height));
+        Talk { id: None, size, frames: submission.cameras.len() as u64, seen: 0, done: None }
+    }
+
+    /// The summary, once every frame has come: it may overtake the last frames, which are
+    /// long.
+    fn finished(&mut self) -> Option<ShotDone> {
+        if self.seen >= self.frames { self.done.take() } else { None }
+    }
+
+    fn hear(&mut self, message: Message) -> Result<Option<Update>, ClientError> {
+        match message {
+            Message::Accepted(accepted) => self.id = Some(accepted.shot),
+            Message::Rejected(rejected) => return Err(ClientError::Refused(rejected.reason)),
+            Message::ShotFailed(failed) => return Err(ClientError::Refused(failed.reason)),
+            Message::ShotDone(done) => self.done = Some(done),
+            Message::Progress(progress) => return Ok(Some(Update::Progress(progress))),
+            Message::FrameFailed(failed) => {
+                self.seen += 1;
+                return Ok(Some(Update::FrameFailed(failed.frame, failed.reason)));
+            }
+            Message::Frame(frame) => {
+                self.seen += 1;
+                return self.unpack(frame).map(Some);
+            }
+            // Pongs, and kinds of a later version.
+            _ => {}
+        }
+        Ok(None)
+    }
+
+    fn unpack(&self, frame: Frame) -> Result<Update, ClientError> {
+        let (width, height) = self.size;
+        let expected = width as usize * height as usize * 3;
+        let unusable = |why: String| ClientError::Refused(format!("a frame is unusable: {why}"));
+        let pixels = frame.pixels.unpack(expected).map_err(|why| unusable(why.to_string()))?;
+        let picture = Rgb8::from_pixels(width, height, Vec::from(pixels))
+            .ok_or_else(|| unusable("its size is wrong".into()))?;
+        let facts = FrameFacts {
+            jobs: frame.jobs,
+            cost_us: frame.report.cost_us,
+            elapsed_us: frame.elapsed_us,
+            below_ground: frame.report.below_ground,
+        };
+        Ok(Update::Frame(frame.frame, picture, facts))
+    }
+}
+
+/// What the submitting task sends.
+struct Plan {
+    submit: Submit,
+    cameras: Vec<Camera>,
+}
+
+impl Submission {
+    fn clone_plan(&self) -> Plan {
+        let (index, _) = self.store.index_blob();
+        let (width, height) =
+            self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
+        let submit = Submit {
+            number: NUMBER,
+            name: clip_name(&self.name),
+            index,
+            shading: self.shading.clone(),
+            quality: self.quality,
+            width,
+            height,
+            split: self.split,
+            frames: self.cameras.len() as u32,
+            frames_in_flight: self.frames_in_flight,
+        };
+        Plan { submit, cameras: self.cameras.clone() }
+    }
+}
+
+async fn send_submission(plan: Plan, outbox: Outbox) -> Result<(), LinkError> {
+    outbox.send(plan.submit).await?;
+    for (piece, cameras) in plan.cameras.chunks(CAMERAS_MAX).enumerate() {
+        let first = (piece * CAMERAS_MAX) as FrameIndex;
+        outbox.send(Cameras { number: NUMBER, first, cameras: cameras.to_vec() }).await?;
+    }
+    Ok(())
+}
+
+/// Answers questions for terrain, one after the other: the disk is read as fast as the
+/// link takes it, and no faster.
+async fn serve_blobs(
+    store: Arc<StoreReader>,
+    mut wanted: mpsc::Receiver<WantBlobs>,
+    outbox: Outbox,
+) -> Result<(), LinkError> {
+    while let Some(want) = wanted.recv().await {
+        for hash in want.hashes {
+            let from = store.clone();
+            let read = tokio::task::spawn_blocking(move || read_blob(&from, hash)).await;
+            match read {
+                Ok(Ok(bytes)) => outbox.send(Blob { hash, bytes }).await?,
+                Ok(Err(why)) => {
+                    tracing::error!(%hash, "cannot supply a blob: {why}");
+                    outbox.send(NoBlob { hash, why: clip_reason(&why) }).await?;
+                }
+                Err(_) => outbox.send(NoBlob { hash, why: "reading it failed".into() }).await?,
+            }
+        }
+    }
+    Ok(())
+}
+
+fn read_blob(store: &StoreReader, hash: BlobHash) -> Result<Bytes, String> {
+    let (index_hash, index) = store.index_blob();
+    if hash == index_hash {
+        return Ok(Bytes::copy_from_slice(index));
+    }
+    store.read_blob(&hash).map(Bytes::from).map_err(|why| why.to_string())
+}

@@ -1,0 +1,500 @@
+//! The coordinator's mind: what each message means, and what is to be sent.
+//!
+//! [`Farm`] joins the scheduler, the shots with their film, and the blob broker. It takes events of peers
+//! and a time, and leaves messages in a queue; it reads no clock and knows no socket. The
+//! driver task (`driver.rs`) owns it and carries the messages.
+
+use crate::blobs::{Broker, ClientId, Order};
+use crate::shots::{FrameHead, Granted, Shots};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
+use terrafarm_common::image::Rgb8;
+use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
+use terrafarm_terrain::store::hash_of;
+use terrafarm_wire::limits::clip_reason;
+use terrafarm_wire::message::{
+    Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
+    Progress, Rejected, Revoke, ShotFailed, WantBlobs,
+};
+
+/// Shortest time between two progress messages of a shot, microseconds.
+const PROGRESS_US: u64 = 200_000;
+
+/// Who a message is from or for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Peer {
+    /// Renders.
+    Worker(WorkerId),
+    /// Submits and takes frames.
+    Client(ClientId),
+}
+
+/// Something that happened at a connection.
+#[derive(Debug)]
+pub enum PeerEvent {
+    /// The handshake is over.
+    Joined(Greeting),
+    /// A message came.
+    Said(Message),
+    /// The connection has ended; why, in words.
+    Gone(LostReason, String),
+}
+
+/// What a peer said of itself.
+#[derive(Debug, Clone)]
+pub struct Greeting {
+    /// What to call it.
+    pub name: String,
+    /// Render threads; 0 for a client.
+    pub threads: u32,
+}
+
+/// Something to be done by the driver.
+#[derive(Debug)]
+pub enum Out {
+    /// Send a message.
+    Send(Peer, Message),
+    /// Pack a finished frame's pixels into its message and send it: packing takes time
+    /// that the driver does not have.
+    SendFrame(ClientId, FrameHead, Rgb8),
+    /// Close a connection, after what was sent before.
+    Close(Peer, String),
+}
+
+/// Everything the coordinator knows.
+pub struct Farm {
+    scheduler: Scheduler,
+    broker: Broker,
+    workers: BTreeMap<WorkerId, WorkerState>,
+    clients: BTreeMap<ClientId, Greeting>,
+    shots: Shots,
+    /// Leases that are held, and those whose end a worker may not have heard of: only the
+    /// scheduler judges, this knows where their pixels belong.
+    granted: BTreeMap<LeaseId, Granted>,
+    out: VecDeque<Out>,
+    pings: u64,
+}
+
+#[derive(Debug)]
+struct WorkerState {
+    greeting: Greeting,
+    /// Shots it has been told of.
+    opened: BTreeSet<ShotId>,
+    leases: BTreeSet<LeaseId>,
+}
+
+impl Farm {
+    /// A farm without peers.
+    pub fn new(scheduler: terrafarm_sched::Config, seed: u64, blob_memory_bytes: usize) -> Self {
+        Farm {
+            scheduler: Scheduler::new(scheduler, seed),
+            broker: Broker::new(blob_memory_bytes),
+            workers: BTreeMap::new(),
+            clients: BTreeMap::new(),
+            shots: Shots::default(),
+            granted: BTreeMap::new(),
+            out: VecDeque::new(),
+            pings: 0,
+        }
+    }
+
+    /// What to do next; `None` when all is said. Call until then after every other call.
+    pub fn poll_out(&mut self) -> Option<Out> {
+        self.out.pop_front()
+    }
+
+    /// When [`Farm::tick`] is due.
+    pub fn next_deadline(&self) -> Option<Micros> {
+        self.scheduler.next_deadline()
+    }
+
+    /// The time of [`Farm::next_deadline`] has come.
+    pub fn tick(&mut self, now: Micros) {
+        self.schedule(now, Event::Tick);
+    }
+
+    /// Something happened at a connection.
+    pub fn handle(&mut self, now: Micros, peer: Peer, event: PeerEvent) {
+        match (peer, event) {
+            (Peer::Worker(worker), event) => self.handle_worker(now, worker, event),
+            (Peer::Client(client), event) => self.handle_client(now, client, event),
+        }
+    }
+
+    fn handle_worker(&mut self, now: Micros, worker: WorkerId, event: PeerEvent) {
+        match event {
+            PeerEvent::Joined(greeting) => {
+                tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
+                let threads = greeting.threads;
+                let state =
+                    WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
+                self.workers.insert(worker, state);
+                self.schedule(now, Event::WorkerJoined { worker, threads });
+            }
+            PeerEvent::Gone(why, how) => {
+                if let Some(name) = self.forget_worker(worker) {
+                    match why {
+                        LostReason::Left => tracing::info!(%worker, %name, "worker left: {how}"),
+                        _ => tracing::warn!(%worker, %name, "worker lost: {how}"),
+                    }
+                }
+                self.schedule(now, Event::WorkerLost { worker, why });
+            }
+            PeerEvent::Said(message) if self.workers.contains_key(&worker) => {
+                self.hear_worker(now, worker, message);
+            }
+            // It has been dropped; what was still on its way does not count.
+            PeerEvent::Said(_) => {}
+        }
+    }
+
+    fn hear_worker(&mut self, now: Micros, worker: WorkerId, message: Message) {
+        self.schedule(now, Event::HeardFrom { worker });
+        match message {
+            Message::Pong(_) => {}
+            Message::Ping(ping) => {
+                self.send(Peer::Worker(worker), Pong { number: ping.number });
+            }
+            Message::Done(done) => self.take_pixels(now, worker, done),
+            Message::Failed(failed) => {
+                let lease = failed.lease;
+                tracing::warn!(%worker, %lease, "job failed: {}", failed.reason);
+                self.end_lease(worker, lease);
+                let reason = failed.reason;
+                self.schedule(now, Event::JobFailed { worker, lease, reason });
+            }
+            Message::HandBack(back) => {
+                for &lease in &back.leases {
+                    self.end_lease(worker, lease);
+                }
+                self.schedule(now, Event::WorkerDraining { worker });
+                self.schedule(now, Event::HandedBack { worker, leases: back.leases });
+            }
+            Message::WantBlobs(want) => self.want_blobs(worker, &want),
+            Message::Goodbye(goodbye) => {
+                tracing::debug!(%worker, "says goodbye: {}", goodbye.reason);
+            }
+            other => self.misbehaved(now, Peer::Worker(worker), &other),
+        }
+    }
+
+    fn handle_client(&mut self, now: Micros, client: ClientId, event: PeerEvent) {
+        match event {
+            PeerEvent::Joined(greeting) => {
+                tracing::info!(client = client.0, name = %greeting.name, "client joined");
+                self.clients.insert(client, greeting);
+            }
+            PeerEvent::Gone(_, how) => {
+                if self.clients.remove(&client).is_some() {
+                    tracing::info!(client = client.0, "client left: {how}");
+                }
+                for shot in self.shots.of_client(client) {
+                    self.schedule(now, Event::ShotCanceled { shot });
+                    self.forget_shot(shot);
+                }
+                let orders = self.broker.client_gone(client);
+                self.carry_out(orders);
+            }
+            PeerEvent::Said(message) if self.clients.contains_key(&client) => {
+                self.hear_client(now, client, message);
+            }
+            PeerEvent::Said(_) => {}
+        }
+    }
+
+    fn hear_client(&mut self, now: Micros, client: ClientId, message: Message) {
+        match message {
+            Message::Pong(_) => {}
+            Message::Ping(ping) => {
+                self.send(Peer::Client(client), Pong { number: ping.number });
+            }
+            Message::Submit(submit) => {
+                let number = submit.number;
+                if let Err(why) = self.shots.submit(client, submit, now) {
+                    let rejected = Rejected { number, reason: clip_reason(&why) };
+                    self.send(Peer::Client(client), rejected);
+                }
+            }
+            Message::Cameras(cameras) => match self.shots.add_cameras(client, &cameras) {
+                Ok(Some((accepted, event))) => {
+                    self.send(Peer::Client(client), accepted);
+                    self.schedule(now, event);
+                }
+                Ok(None) => {}
+                Err(reason) => {
+                    let number = cameras.number;
+                    self.send(Peer::Client(client), Rejected { number, reason });
+                }
+            },
+            Message::FrameTaken(taken) => {
+                if self.shots.belongs_to(taken.shot, client) {
+                    let (shot, frame) = (taken.shot, taken.frame);
+                    self.schedule(now, Event::FrameTaken { shot, frame });
+                }
+            }
+            Message::Cancel(cancel) => {
+                let shot = cancel.shot;
+                if self.shots.belongs_to(shot, client) {
+                    self.schedule(now, Event::ShotCanceled { shot });
+                    self.forget_shot(shot);
+                    let reason = "canceled by the client".into();
+                    self.send(Peer::Client(client), ShotFailed { shot, reason });
+                }
+            }
+            Message::Blob(blob) => {
+                // A wrong blob must not get into the memory that serves every shot.
+                let orders = if hash_of(&blob.bytes) == blob.hash {
+                    self.broker.arrived(blob.hash, blob.bytes)
+                } else {
+                    self.broker.missing(client, blob.hash, "the client sent something else")
+                };
+                self.carry_out(orders);
+            }
+            Message::NoBlob(missing) => {
+                let orders = self.broker.missing(client, missing.hash, &missing.why);
+                self.carry_out(orders);
+            }
+            Message::Goodbye(_) => {}
+            other => self.misbehaved(now, Peer::Client(client), &other),
+        }
+    }
+
+    fn want_blobs(&mut self, worker: WorkerId, want: &WantBlobs) {
+        let opened = self.workers.get(&worker).map(|state| &state.opened);
+        let owners: BTreeSet<_> = opened
+            .into_iter()
+            .flatten()
+            .filter_map(|shot| self.shots.get(*shot).map(|shot| shot.client))
+            .collect();
+        let owners: Vec<_> = owners.into_iter().collect();
+        let orders =
+            want.hashes.iter().filter_map(|&hash| self.broker.wanted(worker, hash, &owners));
+        let orders = orders.collect();
+        self.carry_out(orders);
+    }
+
+    /// Carries out the broker's orders; questions to one client become one message.
+    fn carry_out(&mut self, orders: Vec<Order>) {
+        let mut asks: BTreeMap<ClientId, Vec<_>> = BTreeMap::new();
+        for order in orders {
+            match order {
+                Order::Deliver(worker, hash, bytes) => {
+                    self.send(Peer::Worker(worker), Blob { hash, bytes });
+                }
+                Order::Refuse(worker, hash, why) => {
+                    let why = clip_reason(&why);
+                    self.send(Peer::Worker(worker), NoBlob { hash, why });
+                }
+                Order::Ask(client, hash) => asks.entry(client).or_default().push(hash),
+            }
+        }
+        for (client, hashes) in asks {
+            self.send(Peer::Client(client), WantBlobs { hashes });
+        }
+    }
+
+    /// Pixels came: are they what was asked for, does the lease still hold, and is that
+    /// the last piece of its frame?
+    fn take_pixels(&mut self, now: Micros, worker: WorkerId, done: Done) {
+        let lease = done.lease;
+        let granted = self.granted.get(&lease).filter(|granted| granted.worker == worker).copied();
+        let pixels = match granted {
+            Some(granted) => {
+                let expected = granted.region.area() as usize * 3;
+                match done.pixels.unpack(expected) {
+                    Ok(pixels) => Some(pixels),
+                    Err(why) => {
+                        self.end_lease(worker, lease);
+                        let reason = format!("unusable result: {why}");
+                        self.schedule(now, Event::JobFailed { worker, lease, reason });
+                        return;
+                    }
+                }
+            }
+            // Not held any more: the scheduler will say so.
+            None => None,
+        };
+        let cost_us = done.report.cost_us;
+        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us });
+        let verdict = self.scheduler.poll_action();
+        match (verdict, pixels) {
+            (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
+                let name =
+                    self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
+                self.shots.count_job(shot, frame, name, &done.report);
+                if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
+                    tracing::error!(%shot, "cannot merge pixels: {why}");
+                }
+            }
+            (Some(Action::Refuse { why, .. }), _) => {
+                tracing::info!(%worker, %lease, ?why, "late result refused");
+            }
+            (other, _) => tracing::error!(%lease, ?other, "no verdict on a result"),
+        }
+        self.end_lease(worker, lease);
+        self.obey(now);
+        self.report_progress(now, granted.map(|granted| granted.shot));
+    }
+
+    fn schedule(&mut self, now: Micros, event: Event) {
+        self.scheduler.handle(now, event);
+        self.obey(now);
+    }
+
+    /// Carries out what the scheduler asks for.
+    fn obey(&mut self, now: Micros) {
+        while let Some(action) = self.scheduler.poll_action() {
+            match action {
+                Action::Grant { worker, lease, shot, frame, region } => {
+                    self.grant(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Revoke { worker, lease } => {
+                    self.end_lease(worker, lease);
+                    self.send(Peer::Worker(worker), Revoke { lease });
+                }
+                Action::FrameComplete { shot, frame } => self.finish_frame(now, shot, frame),
+                Action::FrameFailed { shot, frame, reason } => {
+                    tracing::warn!(%shot, frame, "frame failed: {reason}");
+                    if let Some(state) = self.shots.frame_failed(shot, frame) {
+                        let peer = Peer::Client(state.client);
+                        let reason = clip_reason(&reason.to_string());
+                        self.send(peer, FrameFailed { shot, frame, reason });
+                    }
+                }
+                Action::ShotComplete { shot, .. } => {
+                    if let Some((client, done)) = self.shots.summary(shot, now) {
+                        self.send(Peer::Client(client), done);
+                    }
+                    self.forget_shot(shot);
+                }
+                Action::ShotFailed { shot, reason } => {
+                    if let Some(state) = self.shots.get(shot) {
+                        let peer = Peer::Client(state.client);
+                        let reason = clip_reason(&reason.to_string());
+                        self.send(peer, ShotFailed { shot, reason });
+                    }
+                    self.forget_shot(shot);
+                }
+                Action::Probe { worker } => {
+                    self.pings += 1;
+                    let number = self.pings;
+                    self.send(Peer::Worker(worker), Ping { number });
+                }
+                Action::Drop { worker, why } => {
+                    let name = self.forget_worker(worker).unwrap_or_default();
+                    tracing::warn!(%worker, %name, "worker dropped: {why}");
+                    self.out.push_back(Out::Close(Peer::Worker(worker), why.to_string()));
+                }
+                Action::Blocked { worker, shot } => {
+                    tracing::warn!(%worker, %shot, "worker failed too often and gets no more of this shot");
+                }
+                Action::Unblocked { worker, shot } => {
+                    tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
+                }
+                Action::Accept { .. } | Action::Refuse { .. } => {
+                    tracing::error!(?action, "a verdict without a result");
+                }
+            }
+        }
+    }
+
+    fn grant(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
+        let Granted { worker, shot, frame, region } = granted;
+        let (Some(state), Some(worker_state)) =
+            (self.shots.begin_frame(shot, frame, now), self.workers.get_mut(&worker))
+        else {
+            tracing::error!(%shot, %worker, "a job for nobody");
+            return;
+        };
+        let Some(&camera) = state.cameras.get(frame as usize) else {
+            tracing::error!(%shot, frame, "a job without a camera");
+            return;
+        };
+        let open = worker_state.opened.insert(shot).then(|| OpenShot {
+            shot,
+            index: state.submit.index,
+            shading: state.submit.shading.clone(),
+            quality: state.submit.quality,
+            width: state.submit.width,
+            height: state.submit.height,
+        });
+        worker_state.leases.insert(lease);
+        self.granted.insert(lease, granted);
+        if let Some(open) = open {
+            self.send(Peer::Worker(worker), open);
+        }
+        self.send(Peer::Worker(worker), Grant { lease, shot, frame, region, camera });
+    }
+
+    fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {
+        match self.shots.finish_frame(shot, frame, now) {
+            Some((client, head, picture)) => {
+                self.out.push_back(Out::SendFrame(client, head, picture));
+            }
+            None => tracing::error!(%shot, frame, "a complete frame without a picture"),
+        }
+    }
+
+    fn report_progress(&mut self, now: Micros, shot: Option<ShotId>) {
+        let Some(shot) = shot else { return };
+        let jobs_running = self.granted.len() as u32;
+        let workers = self.workers.len() as u32;
+        let Some(state) = self.shots.get_mut(shot) else { return };
+        if now.since(state.progress_at) < PROGRESS_US {
+            return;
+        }
+        state.progress_at = now;
+        let (frames_done, frames_failed) = (state.frames_done, state.frames_failed);
+        let peer = Peer::Client(state.client);
+        self.send(peer, Progress { shot, frames_done, frames_failed, jobs_running, workers });
+    }
+
+    fn end_lease(&mut self, worker: WorkerId, lease: LeaseId) {
+        if self.granted.get(&lease).is_some_and(|granted| granted.worker == worker) {
+            self.granted.remove(&lease);
+        }
+        if let Some(state) = self.workers.get_mut(&worker) {
+            state.leases.remove(&lease);
+        }
+    }
+
+    /// Returns the worker's name if it was known.
+    fn forget_worker(&mut self, worker: WorkerId) -> Option<String> {
+        self.broker.worker_gone(worker);
+        let state = self.workers.remove(&worker)?;
+        for lease in &state.leases {
+            self.granted.remove(lease);
+        }
+        Some(state.greeting.name)
+    }
+
+    fn forget_shot(&mut self, shot: ShotId) {
+        if self.shots.remove(shot).is_none() {
+            return;
+        }
+        let told: Vec<_> = self
+            .workers
+            .iter_mut()
+            .filter_map(|(worker, state)| state.opened.remove(&shot).then_some(*worker))
+            .collect();
+        for worker in told {
+            self.send(Peer::Worker(worker), CloseShot { shot });
+        }
+    }
+
+    fn misbehaved(&mut self, now: Micros, peer: Peer, message: &Message) {
+        let kind = terrafarm_wire::message::kind_name(message.kind());
+        let reason = format!("sent a {kind} message, which is not for this side");
+        tracing::warn!(?peer, "{reason}");
+        self.send(peer, Goodbye { reason: reason.clone() });
+        self.out.push_back(Out::Close(peer, reason.clone()));
+        self.handle(now, peer, PeerEvent::Gone(LostReason::Misbehaved, reason));
+    }
+
+    fn send(&mut self, peer: Peer, message: impl Into<Message>) {
+        self.out.push_back(Out::Send(peer, message.into()));
+    }
+}
+
+#[cfg(test)]
+mod tests;

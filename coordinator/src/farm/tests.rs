@@ -1,0 +1,253 @@
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use bytes::Bytes;
+use glam::DVec3;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::BlobHash;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_wire::message::{Cameras, Failed, HandBack, RenderReport, Submit};
+use terrafarm_wire::pixels::Pixels;
+
+const SIZE: (u32, u32) = (64, 16);
+const CLIENT: ClientId = ClientId(100);
+
+/// A farm, the time, and what it said since it was last asked.
+struct Bench {
+    farm: Farm,
+    now: Micros,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let farm = Farm::new(terrafarm_sched::Config::default(), 1, 1 << 20);
+        Bench { farm, now: Micros(0) }
+    }
+
+    fn event(&mut self, peer: Peer, event: PeerEvent) -> Vec<Out> {
+        self.now = self.now.after(1000);
+        self.farm.handle(self.now, peer, event);
+        std::iter::from_fn(|| self.farm.poll_out()).collect()
+    }
+
+    fn say(&mut self, peer: Peer, message: impl Into<Message>) -> Vec<Out> {
+        self.event(peer, PeerEvent::Said(message.into()))
+    }
+
+    fn join(&mut self, peer: Peer, threads: u32) -> Vec<Out> {
+        self.event(peer, PeerEvent::Joined(Greeting { name: format!("{peer:?}"), threads }))
+    }
+
+    fn gone(&mut self, peer: Peer) -> Vec<Out> {
+        self.event(peer, PeerEvent::Gone(LostReason::Broken, "cut".into()))
+    }
+
+    /// A client with a shot of so many frames.
+    fn submit(&mut self, frames: u32) -> Vec<Out> {
+        self.join(Peer::Client(CLIENT), 0);
+        let submit = Submit {
+            number: 1,
+            name: "test".into(),
+            index: BlobHash([1; 32]),
+            shading: Shading {
+                sun: None,
+                haze: None,
+                sky: Sky::default(),
+                earth: None,
+                below_ground: [0.0; 3],
+                bare_ground: None,
+            },
+            quality: Quality::default(),
+            width: SIZE.0,
+            height: SIZE.1,
+            split: Split::Columns,
+            frames,
+            frames_in_flight: 2,
+        };
+        self.say(Peer::Client(CLIENT), submit);
+        let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
+        let cameras = vec![camera; frames as usize];
+        self.say(Peer::Client(CLIENT), Cameras { number: 1, first: 0, cameras })
+    }
+}
+
+fn worker(number: u64) -> Peer {
+    Peer::Worker(WorkerId(number))
+}
+
+fn grants(out: &[Out]) -> Vec<(WorkerId, Grant)> {
+    let grant = |out: &Out| match out {
+        Out::Send(Peer::Worker(worker), Message::Grant(grant)) => Some((*worker, *grant)),
+        _ => None,
+    };
+    out.iter().filter_map(grant).collect()
+}
+
+fn done(grant: &Grant) -> Done {
+    let pixels = vec![grant.lease.0 as u8; grant.region.area() as usize * 3];
+    let report = RenderReport { cost_us: 500, rays: 1, steps: 1, below_ground: false };
+    Done { lease: grant.lease, report, pixels: Pixels::raw(Bytes::from(pixels)).unwrap() }
+}
+
+/// Answers every grant until none is left; returns the frames that came out.
+fn render_all(bench: &mut Bench, mut out: Vec<Out>) -> Vec<(u32, Rgb8)> {
+    let mut frames = Vec::new();
+    while !out.is_empty() {
+        let mut next = Vec::new();
+        for (worker, grant) in grants(&out) {
+            next.extend(bench.say(Peer::Worker(worker), done(&grant)));
+        }
+        for one in out {
+            if let Out::SendFrame(_, head, picture) = one {
+                let frame = head.with(Pixels::raw(Bytes::new()).unwrap());
+                next.extend(bench.say(
+                    Peer::Client(CLIENT),
+                    terrafarm_wire::message::FrameTaken { shot: frame.shot, frame: frame.frame },
+                ));
+                frames.push((frame.frame, picture));
+            }
+        }
+        out = next;
+    }
+    frames
+}
+
+#[test]
+fn a_shot_travels_from_its_submission_to_its_last_frame() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 2);
+    let out = bench.submit(5);
+    assert!(matches!(&out[0], Out::Send(Peer::Client(CLIENT), Message::Accepted(_))));
+    let opened = out.iter().position(|o| matches!(o, Out::Send(_, Message::OpenShot(_)))).unwrap();
+    let granted = out.iter().position(|o| matches!(o, Out::Send(_, Message::Grant(_)))).unwrap();
+    assert!(opened < granted, "a worker knows the shot before its first job");
+    let frames = render_all(&mut bench, out);
+    assert_eq!(frames.len(), 5);
+    for (_, picture) in &frames {
+        assert!(picture.pixels().iter().all(|&byte| byte != 0), "every pixel came from a job");
+    }
+}
+
+#[test]
+fn what_a_lost_worker_held_is_rendered_by_another_and_its_late_result_is_refused() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.submit(1);
+    let held = grants(&out)[0].1;
+    bench.gone(worker(1));
+    let late = bench.say(worker(1), done(&held));
+    assert!(late.is_empty(), "{late:?}");
+    let out = bench.join(worker(2), 1);
+    assert!(grants(&out).iter().all(|(_, grant)| grant.lease > held.lease));
+    assert_eq!(render_all(&mut bench, out).len(), 1);
+}
+
+#[test]
+fn pixels_of_the_wrong_number_fail_the_job_and_not_the_farm() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.submit(1);
+    let grant = grants(&out)[0].1;
+    let short = Done { pixels: Pixels::raw(Bytes::from(vec![0; 3])).unwrap(), ..done(&grant) };
+    let mut out: Vec<_> = out.into_iter().filter(|o| !matches!(o, Out::Send(_, Message::Grant(g)) if g.lease == grant.lease)).collect();
+    out.extend(bench.say(worker(1), short));
+    out.extend(bench.join(worker(2), 1));
+    assert_eq!(render_all(&mut bench, out).len(), 1);
+}
+
+#[test]
+fn a_job_that_fails_three_times_fails_its_frame_with_the_reason() {
+    let mut bench = Bench::new();
+    let mut out = bench.submit(1);
+    let mut failures = 0;
+    for number in 1..=3 {
+        out.extend(bench.join(worker(number), 1));
+    }
+    let mut said = String::new();
+    while !out.is_empty() {
+        let mut next = Vec::new();
+        for (worker, grant) in grants(&out) {
+            failures += 1;
+            let failed = Failed { lease: grant.lease, reason: "no such tile".into() };
+            next.extend(bench.say(Peer::Worker(worker), failed));
+        }
+        for one in &out {
+            if let Out::Send(Peer::Client(_), Message::FrameFailed(failed)) = one {
+                said = failed.reason.clone();
+            }
+            if let Out::Send(Peer::Client(_), Message::ShotFailed(failed)) = one {
+                said = failed.reason.clone();
+            }
+        }
+        out = next;
+    }
+    assert!(failures >= 3, "{failures}");
+    assert!(said.contains("no such tile"), "{said:?}");
+}
+
+#[test]
+fn when_the_client_goes_away_its_jobs_are_taken_back() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.submit(3);
+    let held = grants(&out).len();
+    assert!(held > 0);
+    let out = bench.gone(Peer::Client(CLIENT));
+    let revoked = out.iter().filter(|o| matches!(o, Out::Send(_, Message::Revoke(_)))).count();
+    assert_eq!(revoked, held);
+    assert!(out.iter().any(|o| matches!(o, Out::Send(_, Message::CloseShot(_)))));
+}
+
+#[test]
+fn a_leaving_worker_hands_back_and_gets_no_more() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.submit(3);
+    let leases = grants(&out).iter().map(|(_, grant)| grant.lease).collect();
+    let out = bench.say(worker(1), HandBack { leases });
+    assert!(grants(&out).is_empty());
+    let out = bench.join(worker(2), 1);
+    assert_eq!(render_all(&mut bench, out).len(), 3);
+}
+
+#[test]
+fn terrain_goes_from_the_client_to_every_worker_that_wants_it() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    bench.join(worker(2), 1);
+    bench.submit(4);
+    let bytes = Bytes::from_static(b"tile");
+    let hash = hash_of(&bytes);
+    let want = || WantBlobs { hashes: vec![hash] };
+    let out = bench.say(worker(1), want());
+    assert!(matches!(&out[..], [Out::Send(Peer::Client(CLIENT), Message::WantBlobs(_))]));
+    assert!(bench.say(worker(2), want()).is_empty(), "asked already");
+    let out = bench.say(Peer::Client(CLIENT), Blob { hash, bytes });
+    assert_eq!(out.len(), 2);
+    let wrong = BlobHash([9; 32]);
+    bench.say(worker(1), WantBlobs { hashes: vec![wrong] });
+    let out = bench.say(Peer::Client(CLIENT), Blob { hash: wrong, bytes: Bytes::from_static(b"x") });
+    assert!(matches!(&out[..], [Out::Send(Peer::Worker(_), Message::NoBlob(_))]), "{out:?}");
+}
+
+#[test]
+fn a_peer_that_sends_what_is_not_its_to_send_is_closed() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.say(worker(1), terrafarm_wire::message::Cancel { shot: ShotId(1) });
+    assert!(out.iter().any(|o| matches!(o, Out::Close(peer, _) if *peer == worker(1))), "{out:?}");
+    let out = bench.submit(1);
+    assert!(grants(&out).is_empty(), "it gets no work");
+}
+
+#[test]
+fn cameras_that_do_not_fit_reject_the_shot() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    bench.submit(1);
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, (8, 8));
+    let out = bench.say(Peer::Client(CLIENT), Cameras { number: 7, first: 0, cameras: vec![camera] });
+    assert!(matches!(&out[..], [Out::Send(_, Message::Rejected(_))]), "{out:?}");
+}

@@ -1,0 +1,139 @@
+//! One connection: greeting, then one task that reads and one that writes.
+
+use crate::driver::{Config, ToDriver, peer_of};
+use crate::farm::{Greeting, PeerEvent};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+use terrafarm_sched::LostReason;
+use terrafarm_wire::link::{self, LinkError, handshake};
+use terrafarm_wire::message::{Message, Role};
+use tokio::net::TcpStream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_util::sync::CancellationToken;
+
+/// Messages that may wait for a peer on each lane: grants and questions on one, blobs and
+/// frames on the other. A worker asks for no more blobs at once than its own limit.
+const URGENT_QUEUE: usize = 4096;
+const BULK_QUEUE: usize = 4096;
+
+/// A client is given up after this many times the silence that a worker may keep.
+const CLIENT_PATIENCE: u32 = 4;
+
+/// What every new connection needs to know.
+#[derive(Clone)]
+pub struct Admission {
+    name: Arc<str>,
+    greeting_limit: Duration,
+    heartbeat: Duration,
+    silence: Duration,
+    seats: Arc<Semaphore>,
+    last_id: Arc<AtomicU64>,
+    events: mpsc::Sender<ToDriver>,
+}
+
+/// What the driver has to know of a peer.
+pub struct PeerTraits {
+    /// What it said of itself.
+    pub greeting: Greeting,
+    /// Whether it is on this PC: then pixels need no packing.
+    pub loopback: bool,
+}
+
+impl Admission {
+    /// Lets in as many peers as the configuration says.
+    pub fn new(config: &Config, events: mpsc::Sender<ToDriver>) -> Self {
+        Admission {
+            name: config.name.as_str().into(),
+            greeting_limit: config.greeting_limit,
+            heartbeat: Duration::from_micros(config.scheduler.heartbeat_us),
+            silence: Duration::from_micros(config.scheduler.silence_us),
+            seats: Arc::new(Semaphore::new(config.connections_max)),
+            last_id: Arc::default(),
+            events,
+        }
+    }
+
+    /// A place for one connection; `None` when all are taken: the connection is closed.
+    pub fn seat(&self) -> Option<OwnedSemaphorePermit> {
+        self.seats.clone().try_acquire_owned().ok()
+    }
+}
+
+/// Serves one connection to its end.
+pub async fn serve(
+    stream: TcpStream,
+    address: SocketAddr,
+    admission: Admission,
+    _seat: OwnedSemaphorePermit,
+) {
+    // Grants are small and must not wait for company.
+    let _ = stream.set_nodelay(true);
+    let program = handshake::program();
+    let greeted = match link::accept(stream, &program, admission.greeting_limit).await {
+        Ok(greeted) => greeted,
+        Err(why) => {
+            tracing::info!(%address, "connection refused: {why}");
+            return;
+        }
+    };
+    let id = admission.last_id.fetch_add(1, Ordering::Relaxed) + 1;
+    let welcomed = greeted.welcome(id, &admission.name, admission.heartbeat, admission.silence);
+    let (connection, hello) = match welcomed.await {
+        Ok(open) => open,
+        Err(why) => {
+            tracing::info!(%address, "greeting not finished: {why}");
+            return;
+        }
+    };
+    let (is_worker, threads) = match hello.role {
+        Role::Worker { threads, .. } => (true, threads),
+        Role::Client => (false, 0),
+    };
+    let peer = peer_of(id, is_worker);
+    let (mut reader, writer) = connection.split();
+    let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
+    let hang_up = CancellationToken::new();
+    let writing = tokio::spawn(writer.run(queues));
+    let traits = PeerTraits {
+        greeting: Greeting { name: hello.name, threads },
+        loopback: address.ip().is_loopback(),
+    };
+    if admission.events.send(ToDriver::Open(peer, outbox, hang_up.clone(), traits)).await.is_err() {
+        return;
+    }
+    // Workers are the scheduler's to watch, which probes them. A client pings by itself;
+    // one that is silent for so long is gone, and its shots hold the farm for nobody.
+    let patience = if is_worker { Duration::MAX } else { admission.silence * CLIENT_PATIENCE };
+    let mut leaving = false;
+    let how = loop {
+        tokio::select! {
+            () = hang_up.cancelled() => break Ok(()),
+            received = reader.recv_within(patience) => match received {
+                Ok(Some(message)) => {
+                    leaving |= matches!(message, Message::Goodbye(_));
+                    let event = ToDriver::Event(peer, PeerEvent::Said(message));
+                    if admission.events.send(event).await.is_err() {
+                        break Ok(());
+                    }
+                }
+                Ok(None) => break Ok(()),
+                Err(why) => break Err(why),
+            },
+        }
+    };
+    let (reason, text) = match how {
+        Ok(()) if leaving => (LostReason::Left, "said goodbye".to_owned()),
+        Ok(()) => (LostReason::Broken, "the connection was closed".to_owned()),
+        Err(why @ LinkError::Wire(_)) => (LostReason::Misbehaved, why.to_string()),
+        Err(why) => (LostReason::Broken, why.to_string()),
+    };
+    let _ = admission.events.send(ToDriver::Event(peer, PeerEvent::Gone(reason, text))).await;
+    // The driver has dropped the outbox by now or will; what is queued is still sent, but
+    // not for ever.
+    let mut writing = writing;
+    if tokio::time::timeout(admission.greeting_limit, &mut writing).await.is_err() {
+        writing.abort();
+    }
+}

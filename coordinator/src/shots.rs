@@ -1,0 +1,324 @@
+//! The shots under way: what was submitted, what has come back, what it took.
+
+use crate::blobs::ClientId;
+use std::collections::BTreeMap;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
+use terrafarm_common::image::Rgb8;
+use terrafarm_common::region::Region;
+use terrafarm_film::{Film, FilmError, Merge};
+use terrafarm_sched::{Event, Micros};
+use terrafarm_wire::limits::WORKER_SHARES_MAX;
+use terrafarm_wire::message::{
+    Accepted, Cameras, Frame, RenderReport, ShotDone, Submit, WorkerShare,
+};
+
+/// Most frames of all shots together: their cameras take about 0.5 GB.
+const CAMERAS_MAX: u64 = 4 << 20;
+/// Most shots of one client at once.
+const SHOTS_PER_CLIENT: usize = 64;
+
+/// Where the pixels of a lease belong.
+#[derive(Debug, Clone, Copy)]
+pub struct Granted {
+    /// To whom it was granted.
+    pub worker: WorkerId,
+    /// The shot.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+    /// The pixels.
+    pub region: Region,
+}
+
+/// One shot.
+#[derive(Debug)]
+pub struct Shot {
+    /// Whose it is.
+    pub client: ClientId,
+    /// What was submitted.
+    pub submit: Submit,
+    /// One camera a frame, as far as they have arrived.
+    pub cameras: Vec<Camera>,
+    /// When it was submitted.
+    pub since: Micros,
+    /// When progress was last told.
+    pub progress_at: Micros,
+    /// Frames finished.
+    pub frames_done: u32,
+    /// Frames given up.
+    pub frames_failed: u32,
+    /// Where its pixels are merged.
+    film: Film,
+    /// Frames begun and not finished.
+    open_frames: BTreeMap<FrameIndex, OpenFrame>,
+    jobs: u64,
+    jobs_granted: u64,
+    report: RenderReport,
+    shares: BTreeMap<String, WorkerShare>,
+}
+
+/// A frame on its way.
+#[derive(Debug)]
+pub struct OpenFrame {
+    since: Micros,
+    jobs: u32,
+    report: RenderReport,
+    picture: Option<Rgb8>,
+}
+
+/// All shots.
+#[derive(Debug, Default)]
+pub struct Shots {
+    shots: BTreeMap<ShotId, Shot>,
+    last: u64,
+    cameras: u64,
+}
+
+impl Shots {
+    /// A shot.
+    pub fn get(&self, shot: ShotId) -> Option<&Shot> {
+        self.shots.get(&shot)
+    }
+
+    /// A shot.
+    pub fn get_mut(&mut self, shot: ShotId) -> Option<&mut Shot> {
+        self.shots.get_mut(&shot)
+    }
+
+    /// Whether the shot is this client's.
+    pub fn belongs_to(&self, shot: ShotId, client: ClientId) -> bool {
+        self.shots.get(&shot).is_some_and(|state| state.client == client)
+    }
+
+    /// The shots of a client.
+    pub fn of_client(&self, client: ClientId) -> Vec<ShotId> {
+        let own = self.shots.iter().filter(|(_, shot)| shot.client == client);
+        own.map(|(id, _)| *id).collect()
+    }
+
+    /// Takes a submission; its cameras follow.
+    ///
+    /// # Errors
+    /// If there is no room for it, in words for the user.
+    pub fn submit(&mut self, client: ClientId, submit: Submit, now: Micros) -> Result<(), String> {
+        let own: Vec<_> = self.shots.values().filter(|shot| shot.client == client).collect();
+        if own.iter().any(|shot| shot.submit.number == submit.number) {
+            return Err(format!("shot number {} is in use on this connection", submit.number));
+        }
+        if own.len() >= SHOTS_PER_CLIENT {
+            return Err(format!("{SHOTS_PER_CLIENT} shots of this client are under way already"));
+        }
+        if self.cameras + u64::from(submit.frames) > CAMERAS_MAX {
+            return Err(format!(
+                "the farm holds {} frames and takes {CAMERAS_MAX} at most; submit again later",
+                self.cameras
+            ));
+        }
+        self.cameras += u64::from(submit.frames);
+        self.last += 1;
+        let shot = Shot {
+            client,
+            cameras: Vec::new(),
+            since: now,
+            progress_at: now,
+            frames_done: 0,
+            frames_failed: 0,
+            film: Film::new(submit.frames_in_flight as usize),
+            open_frames: BTreeMap::new(),
+            jobs: 0,
+            jobs_granted: 0,
+            report: RenderReport::default(),
+            shares: BTreeMap::new(),
+            submit,
+        };
+        self.shots.insert(ShotId(self.last), shot);
+        Ok(())
+    }
+
+    /// Adds cameras to a submission; when the last one is there, the shot begins.
+    ///
+    /// # Errors
+    /// If they do not continue what came before: the shot is dropped.
+    pub fn add_cameras(
+        &mut self,
+        client: ClientId,
+        cameras: &Cameras,
+    ) -> Result<Option<(Accepted, Event)>, String> {
+        let number = cameras.number;
+        let found = self
+            .shots
+            .iter_mut()
+            .find(|(_, shot)| shot.client == client && shot.submit.number == number);
+        let Some((&id, shot)) = found else {
+            return Err("cameras of a shot that was not submitted".into());
+        };
+        let total = shot.submit.frames as usize;
+        let sized = |camera: &Camera| {
+            camera.width == shot.submit.width && camera.height == shot.submit.height
+        };
+        if shot.cameras.len() != cameras.first as usize
+            || shot.cameras.len() + cameras.cameras.len() > total
+            || !cameras.cameras.iter().all(sized)
+        {
+            self.remove(id);
+            return Err("the cameras do not fit the shot".into());
+        }
+        shot.cameras.extend_from_slice(&cameras.cameras);
+        if shot.cameras.len() < total {
+            return Ok(None);
+        }
+        let event = Event::ShotSubmitted {
+            shot: id,
+            frames: shot.submit.frames,
+            width: shot.submit.width,
+            height: shot.submit.height,
+            split: shot.submit.split,
+            priority: 0,
+            frames_in_flight: shot.submit.frames_in_flight,
+        };
+        Ok(Some((Accepted { number, shot: id }, event)))
+    }
+
+    /// A job of a frame is granted: the frame is open from the first one on.
+    pub fn begin_frame(&mut self, shot: ShotId, frame: FrameIndex, now: Micros) -> Option<&Shot> {
+        let state = self.shots.get_mut(&shot)?;
+        state.jobs_granted += 1;
+        if !state.film.is_open(frame) {
+            let (width, height) = (state.submit.width, state.submit.height);
+            if let Err(why) = state.film.open(frame, width, height) {
+                tracing::error!(%shot, "{why}");
+                return None;
+            }
+        }
+        state.open_frames.entry(frame).or_insert_with(|| OpenFrame {
+            since: now,
+            jobs: 0,
+            report: RenderReport::default(),
+            picture: None,
+        });
+        Some(state)
+    }
+
+    /// Counts a job whose pixels are used.
+    pub fn count_job(
+        &mut self,
+        shot: ShotId,
+        frame: FrameIndex,
+        worker: &str,
+        report: &RenderReport,
+    ) {
+        let Some(state) = self.shots.get_mut(&shot) else { return };
+        state.jobs += 1;
+        add(&mut state.report, report);
+        if let Some(open) = state.open_frames.get_mut(&frame) {
+            open.jobs += 1;
+            add(&mut open.report, report);
+        }
+        if let Some(share) = state.shares.get_mut(worker) {
+            share.jobs += 1;
+            share.cost_us = share.cost_us.saturating_add(report.cost_us);
+        } else if state.shares.len() < WORKER_SHARES_MAX {
+            let share = WorkerShare { name: worker.to_owned(), jobs: 1, cost_us: report.cost_us };
+            state.shares.insert(worker.to_owned(), share);
+        }
+    }
+
+    /// Puts pixels in their place. A picture that is whole is kept until the scheduler
+    /// says that its frame is complete.
+    ///
+    /// # Errors
+    /// If they do not fit; nothing is changed then.
+    pub fn merge(
+        &mut self,
+        shot: ShotId,
+        frame: FrameIndex,
+        region: Region,
+        pixels: &[u8],
+    ) -> Result<(), FilmError> {
+        let Some(state) = self.shots.get_mut(&shot) else { return Ok(()) };
+        if let Merge::Complete(picture) = state.film.merge(frame, region, pixels)?
+            && let Some(open) = state.open_frames.get_mut(&frame)
+        {
+            open.picture = Some(picture);
+        }
+        Ok(())
+    }
+
+    /// A frame is complete: its message (still without pixels) and its picture.
+    pub fn finish_frame(
+        &mut self,
+        shot: ShotId,
+        frame: FrameIndex,
+        now: Micros,
+    ) -> Option<(ClientId, FrameHead, Rgb8)> {
+        let state = self.shots.get_mut(&shot)?;
+        let open = state.open_frames.remove(&frame)?;
+        state.frames_done += 1;
+        let head = FrameHead {
+            shot,
+            frame,
+            jobs: open.jobs,
+            report: open.report,
+            elapsed_us: now.since(open.since),
+        };
+        Some((state.client, head, open.picture?))
+    }
+
+    /// A frame is given up.
+    pub fn frame_failed(&mut self, shot: ShotId, frame: FrameIndex) -> Option<&Shot> {
+        let state = self.shots.get_mut(&shot)?;
+        state.open_frames.remove(&frame);
+        state.film.discard(frame);
+        state.frames_failed += 1;
+        Some(state)
+    }
+
+    /// The last word on a shot.
+    pub fn summary(&self, shot: ShotId, now: Micros) -> Option<(ClientId, ShotDone)> {
+        let state = self.shots.get(&shot)?;
+        let done = ShotDone {
+            shot,
+            frames_done: state.frames_done,
+            frames_failed: state.frames_failed,
+            jobs: state.jobs,
+            jobs_repeated: state.jobs_granted.saturating_sub(state.jobs),
+            elapsed_us: now.since(state.since),
+            report: state.report,
+            workers: state.shares.values().cloned().collect(),
+        };
+        Some((state.client, done))
+    }
+
+    /// Forgets a shot.
+    pub fn remove(&mut self, shot: ShotId) -> Option<Shot> {
+        let state = self.shots.remove(&shot)?;
+        self.cameras -= u64::from(state.submit.frames);
+        Some(state)
+    }
+}
+
+/// A frame's message without its pixels.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameHead {
+    shot: ShotId,
+    frame: FrameIndex,
+    jobs: u32,
+    report: RenderReport,
+    elapsed_us: u64,
+}
+
+impl FrameHead {
+    /// The message with its pixels.
+    pub fn with(self, pixels: terrafarm_wire::pixels::Pixels) -> Frame {
+        let FrameHead { shot, frame, jobs, report, elapsed_us } = self;
+        Frame { shot, frame, jobs, report, elapsed_us, pixels }
+    }
+}
+
+fn add(sum: &mut RenderReport, part: &RenderReport) {
+    sum.cost_us = sum.cost_us.saturating_add(part.cost_us);
+    sum.rays = sum.rays.saturating_add(part.rays);
+    sum.steps = sum.steps.saturating_add(part.steps);
+    sum.below_ground |= part.below_ground;
+}

@@ -1,0 +1,102 @@
+//! `manifest.json`: what a render was made of, and what came out. Scripts read it: keys
+//! are added freely, never renamed.
+
+use super::SinkError;
+use super::beside::Beside;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use terrafarm_common::id::FrameIndex;
+
+/// Everything about one render.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// Name and version of the program that made it.
+    pub program: String,
+    /// The scene file, as it was named.
+    pub scene: String,
+    /// SHA-256 of the scene file, hexadecimal.
+    pub scene_sha256: String,
+    /// The terrain store, as the scene names it.
+    pub terrain: String,
+    /// SHA-256 of the store's index, hexadecimal: it stands for every tile.
+    pub terrain_sha256: String,
+    /// The flight file, as it was named; absent for a built-in flight.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub flight: Option<String>,
+    /// What was written: the file, or the folder of a sequence.
+    pub output: String,
+    /// Name of the method.
+    pub method: String,
+    /// Samples along each side of a pixel.
+    pub samples: u32,
+    /// The error that the method was allowed, pixels, if it takes such a setting.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub tolerance_px: Option<f64>,
+    /// Width and height of the frames, pixels.
+    pub size: [u32; 2],
+    /// Frames per second.
+    pub fps: f64,
+    /// The frames, in order; those that failed are left out.
+    pub frames: Vec<FrameEntry>,
+    /// Frames that could not be rendered, and why.
+    pub failed: BTreeMap<FrameIndex, String>,
+    /// Who rendered.
+    pub workers: Vec<WorkerEntry>,
+}
+
+/// What one worker did.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WorkerEntry {
+    /// Its name.
+    pub name: String,
+    /// Jobs whose pixels were used.
+    pub jobs: u64,
+    /// Time it rendered for them, milliseconds.
+    pub render_ms: f64,
+}
+
+/// One frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FrameEntry {
+    /// Index, from 0.
+    pub index: FrameIndex,
+    /// SHA-256 of the pixels, hexadecimal: see [`super::pixels_sha256`].
+    pub sha256: String,
+    /// From the first lease of the frame to its last pixel, milliseconds.
+    pub ms: f64,
+    /// Time that workers rendered for it, all jobs together, milliseconds.
+    pub render_ms: f64,
+    /// Number of jobs it was made of.
+    pub jobs: u32,
+    /// Whether the camera was below the ground.
+    pub below_ground: bool,
+    /// With `--check`: 99th percentile of the error, pixels.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub error_px_p99: Option<f64>,
+    /// With `--check`: share of pixels that see another part of the ground.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub mismatch: Option<f64>,
+}
+
+impl Manifest {
+    /// Writes the manifest beside an output, whole or not at all; returns where it is.
+    pub fn save(&self, output: &Path) -> Result<PathBuf, SinkError> {
+        let path = place(output);
+        let mut text = serde_json::to_vec_pretty(self)
+            .map_err(|error| SinkError::output(&path, error.to_string()))?;
+        text.push(b'\n');
+        let mut file = Beside::create(&path)?;
+        file.write(&text)?;
+        file.commit()?;
+        Ok(path)
+    }
+}
+
+/// Where the manifest of an output is: in the folder of a sequence, next to a file.
+pub fn place(output: &Path) -> PathBuf {
+    if output.is_dir() {
+        return output.join("manifest.json");
+    }
+    output.with_file_name("manifest.json")
+}

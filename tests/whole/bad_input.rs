@@ -1,0 +1,266 @@
+//! What is wrong is said, nothing half-written stays, the exit code is 2.
+
+use crate::support::{Dir, Running, World, coordinator, run, succeed, terrafarm, worker};
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Duration;
+
+/// An import that must fail: the message names what matters and nothing is left.
+fn import_fails(name: &str, content: &[u8], extra: &[&str], said: &[&str]) {
+    let dir = Dir::new();
+    let input = dir.write(name, content);
+    let before = dir.names();
+    let (_, stderr) = run(
+        terrafarm()
+            .args(["terrain", "import"])
+            .arg(&input)
+            .arg("-o")
+            .arg(dir.path("x.terrain"))
+            .args(extra),
+        2,
+    );
+    for text in said.iter().chain(&[name]) {
+        assert!(stderr.contains(text), "{text:?} is not in: {stderr}");
+    }
+    assert_eq!(dir.names(), before, "something was left behind");
+}
+
+#[test]
+fn an_hgt_of_the_wrong_size_names_the_sizes_it_may_have() {
+    import_fails("N10E010.hgt", &[0; 1000], &[], &["1201", "3601", "1000"]);
+}
+
+#[test]
+fn a_short_ascii_grid_says_how_many_values_are_missing() {
+    let text = "ncols 3\nnrows 3\nxllcorner 500000\nyllcorner 5000000\ncellsize 10\n1 2 3\n4 5 6\n";
+    import_fails("short.asc", text.as_bytes(), &["--source-crs", "EPSG:32633"], &["9", "6"]);
+}
+
+#[test]
+fn declared_sizes_of_10_to_the_9_are_refused_without_memory() {
+    let text = "ncols 1000000000\nnrows 1000000000\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n";
+    import_fails("vast.asc", text.as_bytes(), &["--source-crs", "EPSG:32633"], &["1000000000"]);
+}
+
+#[test]
+fn a_grid_without_a_reference_system_says_how_to_give_one() {
+    let text = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3 4\n";
+    import_fails("where.asc", text.as_bytes(), &[], &["--source-crs"]);
+}
+
+#[test]
+fn an_unknown_reference_system_is_named() {
+    let text = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3 4\n";
+    let dir = Dir::new();
+    let input = dir.write("grid.asc", text);
+    let (_, stderr) = run(
+        terrafarm()
+            .args(["terrain", "import", "--source-crs", "EPSG:999999"])
+            .arg(&input)
+            .arg("-o")
+            .arg(dir.path("x.terrain")),
+        2,
+    );
+    assert!(stderr.contains("EPSG:999999"), "{stderr}");
+}
+
+#[test]
+fn a_file_of_no_known_format_lists_the_known_ones() {
+    import_fails("notes.txt", b"hello, this is not elevation\n", &[], &["GeoTIFF"]);
+}
+
+#[test]
+fn a_missing_file_is_named() {
+    let dir = Dir::new();
+    let (_, stderr) = run(
+        terrafarm()
+            .args(["terrain", "import"])
+            .arg(dir.path("nowhere.tif"))
+            .arg("-o")
+            .arg(dir.path("x.terrain")),
+        2,
+    );
+    assert!(stderr.contains("nowhere.tif"), "{stderr}");
+}
+
+#[test]
+fn a_damaged_store_is_refused_whole() {
+    let world = World::new(40);
+    let store = world.dir.path("land.terrain");
+    let whole = fs::read(&store).unwrap();
+    for (damage, said) in [
+        (whole[..whole.len() / 2].to_vec(), "land.terrain"),
+        (b"not a store at all".to_vec(), "land.terrain"),
+        (Vec::new(), "land.terrain"),
+    ] {
+        fs::write(&store, damage).unwrap();
+        let (_, stderr) = run(terrafarm().args(["terrain", "info"]).arg(&store), 2);
+        assert!(stderr.contains(said), "{stderr}");
+    }
+}
+
+#[test]
+fn a_corrupt_tile_fails_the_frames_that_need_it_and_says_which() {
+    let world = World::new(40);
+    let store = world.dir.path("land.terrain");
+    let mut bytes = fs::read(&store).unwrap();
+    // Tiles come first in the file, the index last: this hits a tile.
+    let middle = bytes.len() / 4;
+    bytes[middle] ^= 0x55;
+    fs::write(&store, bytes).unwrap();
+    let output = world.dir.path("out");
+    let result = world
+        .render()
+        .args(["--size", "64x36", "--frames", "0..2", "--workers", "1", "-o"])
+        .arg(&output)
+        .output()
+        .unwrap();
+    let stderr = String::from_utf8(result.stderr).unwrap();
+    assert_ne!(result.status.code(), Some(0), "{stderr}");
+    assert!(stderr.contains("tile") || stderr.contains("corrupt"), "{stderr}");
+}
+
+/// A render that must fail before it starts.
+fn render_fails(flight: &str, said: &[&str]) {
+    let world = World::new(40);
+    fs::write(&world.flight, flight).unwrap();
+    let output = world.dir.path("out");
+    let (_, stderr) = run(world.render().args(["--workers", "1", "-o"]).arg(&output), 2);
+    for text in said {
+        assert!(stderr.contains(text), "{text:?} is not in: {stderr}");
+    }
+    assert!(!output.exists(), "something was left behind");
+}
+
+#[test]
+fn an_unknown_column_is_named_with_its_line() {
+    render_fails("t,x,y,z,heading,pich\n0,1,1,1,0,0\n", &["flight.csv", "line 1", "pich", "pitch"]);
+}
+
+#[test]
+fn a_number_that_is_none_is_named_with_its_line_and_column() {
+    render_fails("t,x,y,z,heading,pitch\n0,1,1,1,0,0\n1,1,nan,1,0,0\n", &["line 3", "y"]);
+}
+
+#[test]
+fn a_flight_outside_the_terrain_names_both_places() {
+    render_fails("t,x,y,z,heading,pitch\n0,9e6,9e6,100,0,0\n1,9e6,9e6,100,0,0\n", &["outside"]);
+}
+
+#[test]
+fn a_scene_with_an_unknown_key_is_refused_with_its_line() {
+    let world = World::new(40);
+    fs::write(&world.scene, "terrain = \"land.terrain\"\n\n[sun]\nazimut = 3\n").unwrap();
+    let output = world.dir.path("out");
+    let (_, stderr) = run(world.render().arg("-o").arg(&output), 2);
+    assert!(stderr.contains("azimut") && stderr.contains('4'), "{stderr}");
+}
+
+#[test]
+fn an_unknown_method_lists_the_known_ones() {
+    let world = World::new(40);
+    let (_, stderr) =
+        run(world.render().args(["--method", "exat", "-o"]).arg(world.dir.path("o")), 2);
+    assert!(stderr.contains("exact"), "{stderr}");
+}
+
+#[test]
+fn a_coordinator_that_is_not_there_is_named() {
+    let world = World::new(40);
+    let (_, stderr) = run(
+        world.render().args(["--coordinator", "127.0.0.1:1", "-o"]).arg(world.dir.path("o")),
+        2,
+    );
+    assert!(stderr.contains("127.0.0.1:1"), "{stderr}");
+}
+
+#[test]
+fn a_coordinator_open_to_the_network_must_be_asked_for() {
+    let (_, stderr) = run(terrafarm().args(["coordinator", "--listen", "0.0.0.0:0"]), 2);
+    assert!(stderr.contains("--plain"), "{stderr}");
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_said_before_rendering() {
+    let world = World::new(40);
+    let (_, stderr) =
+        run(world.render().args(["--workers", "1", "-o", "/proc/terrafarm-nowhere/out.mp4"]), 2);
+    assert!(stderr.contains("/proc/terrafarm-nowhere"), "{stderr}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_is_said_and_leaves_nothing() {
+    // /dev/full takes no byte; a store cannot be renamed onto it, so this goes through the
+    // folder that holds it.
+    if !fs::metadata("/dev/full").is_ok_and(|data| !data.is_dir()) {
+        println!("skipped: there is no /dev/full");
+        return;
+    }
+    let world = World::new(40);
+    let (_, stderr) = run(
+        world.render().args([
+            "--size",
+            "64x36",
+            "--frames",
+            "0..2",
+            "--workers",
+            "1",
+            "-o",
+            "/dev/full/out.mp4",
+        ]),
+        2,
+    );
+    assert!(stderr.contains("/dev/full"), "{stderr}");
+}
+
+/// Says something to a coordinator that no peer would say; the coordinator must close the
+/// connection and go on serving others.
+fn coordinator_survives(bytes: &[u8]) {
+    let (_coordinator, address) = coordinator();
+    let mut peer = TcpStream::connect(&address).unwrap();
+    peer.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    // The far side may close before everything is written: that is fine.
+    let _ = peer.write_all(bytes);
+    let mut answer = Vec::new();
+    let _ = peer.read_to_end(&mut answer);
+    let world = World::new(40);
+    let mut good = worker(&address, "good");
+    let render = Running::start(
+        world
+            .render()
+            .args(["--size", "64x36", "--frames", "0..2", "--coordinator", &address, "-o"])
+            .arg(world.dir.path("out")),
+    );
+    good.expect("job begun");
+    let (code, lines) = render.finish();
+    assert_eq!(code, Some(0), "{lines:#?}");
+}
+
+#[test]
+fn a_peer_that_speaks_garbage_harms_nobody() {
+    coordinator_survives(b"GET / HTTP/1.1\r\nHost: farm\r\n\r\n");
+    coordinator_survives(&[0xff; 4096]);
+}
+
+#[test]
+fn a_peer_that_declares_vast_lengths_harms_nobody() {
+    // A sound start of a frame, then lengths of 2^32 - 1.
+    let mut frame = terrafarm_wire::frame::MAGIC.to_vec();
+    frame.extend([0xff; 60]);
+    coordinator_survives(&frame);
+}
+
+#[test]
+fn an_existing_store_is_not_replaced_unless_asked() {
+    let dir = Dir::new();
+    let store = dir.write("x.terrain", "precious");
+    let mut synth = terrafarm();
+    synth.args(["terrain", "synth", "--size", "20", "-o"]).arg(&store);
+    let (_, stderr) = run(&mut synth, 2);
+    assert!(stderr.contains("--force"), "{stderr}");
+    assert_eq!(fs::read(&store).unwrap(), b"precious");
+    succeed(synth.arg("--force"));
+    assert_ne!(fs::read(&store).unwrap(), b"precious");
+}

@@ -1,0 +1,284 @@
+//! Commands that write files: what they leave, and what it says.
+
+use crate::support::{Dir, World, run, shared_data, succeed, terrafarm};
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// Whether a program we compare with is here. Where the tests must not skip
+/// (`TERRAFARM_REQUIRE_ORACLES`), its absence is a failure.
+fn oracle(program: &str) -> bool {
+    let here = Command::new(program)
+        .arg("--version")
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .status()
+        .is_ok();
+    if !here {
+        assert!(
+            std::env::var_os("TERRAFARM_REQUIRE_ORACLES").is_none(),
+            "{program} is not on PATH"
+        );
+        println!("skipped: {program} is not on PATH");
+    }
+    here
+}
+
+#[test]
+fn a_png_sequence_is_numbered_and_has_a_manifest() {
+    let world = World::new(60);
+    let output = world.dir.path("pictures");
+    succeed(
+        world
+            .render()
+            .args(["--size", "64x36", "--frames", "0..3", "--workers", "1", "-o"])
+            .arg(&output),
+    );
+    let mut names: Vec<_> = fs::read_dir(&output)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    assert_eq!(names, ["frame_00000.png", "frame_00001.png", "frame_00002.png", "manifest.json"]);
+    let manifest: serde_json::Value =
+        serde_json::from_slice(&fs::read(output.join("manifest.json")).unwrap()).unwrap();
+    assert_eq!(manifest["size"], serde_json::json!([64, 36]));
+    assert_eq!(manifest["method"], "exact");
+    assert_eq!(manifest["frames"].as_array().unwrap().len(), 3);
+    let picture = read_png(&output.join("frame_00001.png"));
+    assert_eq!(
+        manifest["frames"][1]["sha256"].as_str().unwrap(),
+        hex(&<sha2::Sha256 as sha2::Digest>::digest(&picture.2))
+    );
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn read_png(path: &Path) -> (u32, u32, Vec<u8>) {
+    let decoder = png::Decoder::new(std::io::BufReader::new(fs::File::open(path).unwrap()));
+    let mut reader = decoder.read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    pixels.truncate(info.buffer_size());
+    (info.width, info.height, pixels)
+}
+
+#[test]
+fn mp4_and_y4m_hold_the_frames_and_their_colours() {
+    if !oracle("ffmpeg") {
+        return;
+    }
+    let world = World::new(120);
+    let pictures = world.dir.path("pictures");
+    let arguments = ["--size", "192x108", "--frames", "0..5", "--workers", "1", "-o"];
+    succeed(world.render().args(arguments).arg(&pictures));
+    for name in ["film.mp4", "film.y4m"] {
+        let film = world.dir.path(name);
+        succeed(world.render().args(arguments).arg(&film));
+        let raw = Command::new("ffmpeg")
+            .args(["-v", "warning", "-i"])
+            .arg(&film)
+            .args(["-f", "rawvideo", "-pix_fmt", "rgb24", "-"])
+            .output()
+            .unwrap();
+        assert_eq!(String::from_utf8_lossy(&raw.stderr), "", "{name}");
+        let frame_bytes = 192 * 108 * 3;
+        assert_eq!(raw.stdout.len(), 5 * frame_bytes, "{name}");
+        for index in 0..5 {
+            let (_, _, truth) = read_png(&pictures.join(format!("frame_{index:05}.png")));
+            let shown = &raw.stdout[index * frame_bytes..][..frame_bytes];
+            let squares: f64 =
+                truth.iter().zip(shown).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+            let psnr = 10.0 * (255.0f64.powi(2) * frame_bytes as f64 / squares.max(1.0)).log10();
+            assert!(psnr > 28.0, "{name} frame {index}: {psnr:.1} dB");
+        }
+    }
+}
+
+#[test]
+fn sampling_reads_columns_in_any_order_and_leaves_voids_empty() {
+    let dir = Dir::new();
+    let grid = dir.write(
+        "g.asc",
+        "ncols 3\nnrows 2\nxllcenter 500000\nyllcenter 5000000\ncellsize 10\nNODATA_value -1\n\
+         1 2 -1\n4 6 8\n",
+    );
+    let store = dir.path("g.terrain");
+    succeed(
+        terrafarm()
+            .args(["terrain", "import", "--source-crs", "EPSG:32633"])
+            .arg(&grid)
+            .arg("-o")
+            .arg(&store),
+    );
+    let points = dir.write(
+        "p.csv",
+        "name,y,x\nsw,5000000,500000\nmid,5000005,500005\nvoid,5000010,500020\nfar,0,0\n",
+    );
+    let csv =
+        succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&points));
+    let lines: Vec<_> = csv.lines().collect();
+    assert_eq!(lines[0], "name,y,x,height_m");
+    assert_eq!(lines[1], "sw,5000000,500000,4");
+    assert_eq!(lines[2], "mid,5000005,500005,3.25");
+    assert_eq!(lines[3], "void,5000010,500020,");
+    assert_eq!(lines[4], "far,0,0,");
+}
+
+#[test]
+fn info_is_readable_by_people_and_scripts() {
+    let world = World::new(300);
+    let store = world.dir.path("land.terrain");
+    let text = succeed(terrafarm().args(["terrain", "info"]).arg(&store));
+    for word in ["LOCAL", "300", "levels", "bytes per post"] {
+        assert!(text.contains(word), "{word} is not in\n{text}");
+    }
+    let json = succeed(terrafarm().args(["terrain", "info", "--json"]).arg(&store));
+    let info: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert!(info["layers"].as_array().unwrap().len() >= 2, "{json}");
+}
+
+#[test]
+fn the_same_seed_makes_the_same_store() {
+    let dir = Dir::new();
+    for name in ["a.terrain", "b.terrain"] {
+        succeed(
+            terrafarm()
+                .args(["terrain", "synth", "--size", "130", "--seed", "3", "-o"])
+                .arg(dir.path(name)),
+        );
+    }
+    assert!(fs::read(dir.path("a.terrain")).unwrap() == fs::read(dir.path("b.terrain")).unwrap());
+}
+
+#[test]
+fn the_simulator_keeps_its_promises_for_a_few_seeds() {
+    let dir = Dir::new();
+    for seed in 1..=3 {
+        let json = dir.path("sim.json");
+        succeed(
+            terrafarm()
+                .args(["simulate", "--workers", "31", "--frames", "60", "--faults", "--seed"])
+                .arg(seed.to_string())
+                .arg("--json")
+                .arg(&json),
+        );
+        let report: serde_json::Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
+        let broken: Vec<_> = report["invariants"]
+            .as_object()
+            .unwrap()
+            .iter()
+            .filter(|(_, n)| n.as_u64() != Some(0))
+            .collect();
+        assert!(broken.is_empty(), "seed {seed}: {broken:?}");
+    }
+}
+
+/// Heights of `gdallocationinfo` at lon/lat points, bilinear between samples.
+fn gdal_heights(file: &Path, points: &[[f64; 2]]) -> Vec<Option<f64>> {
+    let mut child = Command::new("gdallocationinfo")
+        .args(["-valonly", "-wgs84", "-r", "bilinear"])
+        .arg(file)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    let text: String = points.iter().map(|[lon, lat]| format!("{lon} {lat}\n")).collect();
+    std::thread::spawn(move || stdin.write_all(text.as_bytes()));
+    let output = child.wait_with_output().unwrap();
+    String::from_utf8(output.stdout).unwrap().lines().map(|line| line.trim().parse().ok()).collect()
+}
+
+#[test]
+fn real_terrain_imports_and_agrees_with_gdal_within_the_reported_error() {
+    let Some(data) = shared_data() else { return };
+    if !oracle("gdallocationinfo") {
+        return;
+    }
+    let bilinear = Command::new("gdallocationinfo").arg("--help").output().unwrap();
+    let help = [bilinear.stdout, bilinear.stderr].concat();
+    let bilinear = String::from_utf8_lossy(&help).contains("-r ");
+    let cases = [
+        ("zion/srtm.tif", [-113.23, -112.86, 37.14, 37.50], 1.0),
+        ("rmnp/rmnp-dem.tif", [-105.9, -105.5, 40.17, 40.54], 1.0),
+        ("rmnp/SRTMGL3_40.09_-105.55.asc", [-105.54, -105.36, 40.10, 40.20], 1.0),
+    ];
+    let dir = Dir::new();
+    for (name, [west, east, south, north], _) in cases {
+        let store = dir.path("x.terrain");
+        succeed(
+            terrafarm()
+                .args(["terrain", "import", "--force", "--source-crs", "EPSG:4326"])
+                .arg(data.join(name))
+                .arg("-o")
+                .arg(&store),
+        );
+        let info: serde_json::Value = serde_json::from_str(&succeed(
+            terrafarm().args(["terrain", "info", "--json"]).arg(&store),
+        ))
+        .unwrap();
+        let reported = info["report"]["max_resampling_error_m"].as_f64().unwrap();
+        assert!(reported > 0.0, "{name}: a reprojection has an error");
+        if !bilinear {
+            println!("skipped: this gdallocationinfo does not interpolate");
+            continue;
+        }
+        let points: Vec<_> = (0..400)
+            .map(|n| {
+                let (a, b) = (f64::from(n % 20) / 19.0, f64::from(n / 20) / 19.0);
+                [
+                    west + (east - west) * (0.013 + 0.97 * a),
+                    south + (north - south) * (0.017 + 0.96 * b),
+                ]
+            })
+            .collect();
+        let truth = gdal_heights(&data.join(name), &points);
+        let csv: String = points.iter().map(|[lon, lat]| format!("{lon},{lat}\n")).collect();
+        let list = dir.write("points.csv", format!("lon,lat\n{csv}"));
+        let sampled =
+            succeed(terrafarm().args(["terrain", "sample"]).arg(&store).arg("--points").arg(&list));
+        let mut compared = 0;
+        for (line, truth) in sampled.lines().skip(1).zip(&truth) {
+            let height: Option<f64> = line.rsplit(',').next().unwrap().parse().ok();
+            if let (Some(height), Some(truth)) = (height, truth) {
+                assert!(
+                    (height - truth).abs() <= reported,
+                    "{name}: {line}, gdal says {truth}, reported {reported}"
+                );
+                compared += 1;
+            }
+        }
+        assert!(compared > 200, "{name}: only {compared} points compared");
+    }
+}
+
+#[test]
+fn a_hillshade_can_be_looked_at() {
+    let world = World::new(100);
+    let picture = world.dir.path("shade.png");
+    succeed(
+        terrafarm()
+            .args(["terrain", "hillshade"])
+            .arg(world.dir.path("land.terrain"))
+            .arg("-o")
+            .arg(&picture),
+    );
+    let (width, height, pixels) = read_png(&picture);
+    assert_eq!((width, height), (100, 100));
+    let inner: Vec<_> = pixels.iter().filter(|&&grey| grey > 0).collect();
+    assert!(inner.len() > 9000);
+}
+
+#[test]
+fn help_and_version_end_well() {
+    for arguments in
+        [&["--help"][..], &["--version"], &["render", "--help"], &["terrain", "import", "--help"]]
+    {
+        succeed(terrafarm().args(arguments));
+    }
+    run(terrafarm().arg("fly-me-to-the-moon"), 2);
+}
