@@ -102,7 +102,7 @@ pub enum Outcome<C: Caster> {
     /// All of it.
     Done(Picture),
     /// It waits for these tiles.
-    Missing(Job<C>, Vec<TileKey>),
+    Missing(Box<Job<C>>, Vec<TileKey>),
     /// It was stopped.
     Stopped,
 }
@@ -136,7 +136,11 @@ impl<C: Caster> Job<C> {
 
     /// Renders what can be rendered, on the thread pool it is called on. Gives the reason
     /// if the ray caster panics.
-    pub fn advance(mut self, caster: &C, scene: &Scene<C::Prepared>) -> Result<Outcome<C>, String> {
+    pub fn advance(
+        mut self: Box<Self>,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+    ) -> Result<Outcome<C>, String> {
         let began = Instant::now();
         let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene)));
         self.spent += began.elapsed();

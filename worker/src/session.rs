@@ -180,26 +180,23 @@ impl Session {
 
     fn receive(&mut self, message: Message) {
         match message {
-            Message::OpenShot(shot) => {
-                if self.shots.len() < SHOTS_MAX {
+            Message::OpenShot(shot)
+                if self.shots.len() < SHOTS_MAX => {
                     self.shots.insert(shot.shot, Arc::new(shot));
                 }
-            }
             Message::Grant(grant) => self.granted(grant),
             Message::Revoke(revoke) => self.revoke(revoke.lease),
             Message::CloseShot(close) => self.close(close.shot),
-            Message::Blob(blob) => {
+            Message::Blob(blob)
                 // One that was not asked for is dropped unread.
-                if self.answered(blob.hash) {
+                if self.answered(blob.hash) => {
                     self.blobs.insert(blob.hash, Supply::Loading);
                     self.actions.push_back(Action::Take(blob));
                 }
-            }
-            Message::NoBlob(NoBlob { hash, why }) => {
-                if self.answered(hash) {
+            Message::NoBlob(NoBlob { hash, why })
+                if self.answered(hash) => {
                     self.failed_supply(hash, &why);
                 }
-            }
             Message::Drain(_) => self.leave("the coordinator asked for it".to_owned()),
             _ => {}
         }
@@ -270,12 +267,14 @@ impl Session {
 
     /// Says goodbye when the last job is answered.
     fn finish(&mut self) {
-        if self.current.is_none() && self.queue.is_empty() && self.unsent == 0 {
-            if let Some(reason) = self.leaving.take() {
-                self.send(Goodbye { reason: clip_reason(&reason) });
-                self.actions.push_back(Action::End);
-                self.ended = true;
-            }
+        if self.current.is_none()
+            && self.queue.is_empty()
+            && self.unsent == 0
+            && let Some(reason) = self.leaving.take()
+        {
+            self.send(Goodbye { reason: clip_reason(&reason) });
+            self.actions.push_back(Action::End);
+            self.ended = true;
         }
     }
 

@@ -18,7 +18,8 @@ use std::time::Duration;
 use terrafarm_common::id::{BlobHash, LeaseId};
 use terrafarm_raycast::View;
 use terrafarm_terrain::cache::BlobCache;
-use terrafarm_terrain::codec;
+use terrafarm_terrain::codec::{self, CodecError};
+use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
@@ -52,7 +53,7 @@ enum Report<C: Caster> {
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
     Done(Done),
-    Missing(Job<C>, Vec<terrafarm_terrain::layout::TileKey>),
+    Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
     Broken(LeaseId, String),
 }
@@ -65,7 +66,7 @@ pub(crate) struct Shift<'a, C: Caster> {
     silence: Duration,
     /// The store of the job that is begun, and how to stop it.
     current: Option<(BlobHash, Arc<AtomicBool>)>,
-    paused: Option<Job<C>>,
+    paused: Option<Box<Job<C>>>,
     /// What the outbox had no room for, in order.
     backlog: VecDeque<Message>,
     ended: bool,
@@ -206,10 +207,10 @@ impl<'a, C: Caster> Shift<'a, C> {
         let Some(cache) = self.site.cache.clone() else {
             return Some(Event::Absent(hash));
         };
-        let (caster, is_tile) = (self.site.caster.clone(), self.site.terrain.is_tile(hash));
+        let caster = self.site.caster.clone();
         self.spawn(
             move || match cache.get(&hash) {
-                Some(bytes) => decoded(&*caster, hash, &bytes, is_tile),
+                Some(bytes) => decoded(&*caster, hash, &bytes),
                 None => Report::Absent(hash),
             },
             move |panic| Report::Spoiled(hash, panic),
@@ -219,7 +220,7 @@ impl<'a, C: Caster> Shift<'a, C> {
 
     fn take(&mut self, blob: Blob) -> Option<Event> {
         let Blob { hash, bytes } = blob;
-        let (caster, is_tile) = (self.site.caster.clone(), self.site.terrain.is_tile(hash));
+        let caster = self.site.caster.clone();
         let cache = self.site.cache.clone();
         let keep = move |bytes: &Bytes| {
             if let Some(Err(error)) = cache.map(|cache| cache.put(&hash, bytes)) {
@@ -231,7 +232,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 if hash_of(&bytes) != hash {
                     return Report::Spoiled(hash, "what came has another hash".to_owned());
                 }
-                let report = decoded(&*caster, hash, &bytes, is_tile);
+                let report = decoded(&*caster, hash, &bytes);
                 if !matches!(report, Report::Spoiled(..)) {
                     keep(&bytes);
                 }
@@ -249,19 +250,31 @@ impl<'a, C: Caster> Shift<'a, C> {
         self.current = Some((shot.index, stop.clone()));
         let view =
             View { camera: grant.camera, shading: shot.shading.clone(), quality: shot.quality };
-        self.paused = Some(Job::new(&*self.site.caster, grant.lease, view, grant.region, stop));
-        self.resume(grant.lease)
+        let (lease, region) = (grant.lease, grant.region);
+        self.launch(lease, move |caster| Box::new(Job::new(caster, lease, view, region, stop)))
     }
 
     fn resume(&mut self, lease: LeaseId) -> Option<Event> {
+        let Some(job) = self.paused.take() else {
+            return Some(Event::Broken(lease, "it is not paused".to_owned()));
+        };
+        self.launch(lease, move |_| job)
+    }
+
+    /// Puts a job on the thread pool: everything that grows with its size happens there.
+    fn launch(
+        &mut self,
+        lease: LeaseId,
+        job: impl FnOnce(&C) -> Box<Job<C>> + Send + 'static,
+    ) -> Option<Event> {
         let scene = self.current.as_ref().and_then(|(store, _)| self.site.terrain.scene(*store));
-        let (Some(job), Some(scene)) = (self.paused.take(), scene) else {
-            return Some(Event::Broken(lease, "its terrain is no longer in memory".to_owned()));
+        let Some(scene) = scene else {
+            return Some(Event::Broken(lease, "its terrain is not in memory".to_owned()));
         };
         let (caster, compress) = (self.site.caster.clone(), self.compress);
         self.spawn(
             move || {
-                let outcome = job.advance(&*caster, &scene);
+                let outcome = job(&caster).advance(&*caster, &scene);
                 // The tiles are free to change before anyone hears of the outcome.
                 drop(scene);
                 match outcome {
@@ -347,12 +360,12 @@ async fn send_waiting(outbox: &Outbox, message: Option<Message>) -> Result<(), L
     }
 }
 
-fn decoded<C: Caster>(caster: &C, hash: BlobHash, bytes: &[u8], is_tile: bool) -> Report<C> {
-    if is_tile {
-        return match codec::decode(bytes) {
-            Ok(tile) => Report::Tile(hash, tile),
-            Err(error) => Report::Spoiled(hash, error.to_string()),
-        };
+/// A blob says itself whether it is a tile; what is none should be an index.
+fn decoded<C: Caster>(caster: &C, hash: BlobHash, bytes: &[u8]) -> Report<C> {
+    match codec::decode(bytes) {
+        Ok(tile) => return Report::Tile(hash, tile),
+        Err(CodecError::NotATile) => {}
+        Err(error) => return Report::Spoiled(hash, error.to_string()),
     }
     match decode_index(bytes) {
         Ok(index) => {

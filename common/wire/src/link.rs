@@ -10,7 +10,7 @@
 pub mod handshake;
 pub mod outbox;
 
-pub use handshake::{Greeting, HandshakeError, accept, greet};
+pub use handshake::{Greeting, HandshakeError, accept, greet, program};
 pub use outbox::{Outbox, OutboxEnd, Unsent, outbox};
 
 use crate::codec::{Decoder, Phase, WireError, encode};

@@ -1,0 +1,12 @@
+//! The worker against a scripted coordinator over TCP on loopback.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+/// A small store, its blobs, and what its pictures must look like.
+mod scene;
+/// The scripted coordinator, and a ray caster that stops at a gate.
+mod script;
+
+/// What breaks and what must happen then.
+mod faults;
+/// Jobs, terrain, pixels, and leaving.
+mod work;

@@ -1,0 +1,130 @@
+use crate::scene::{SIZE, Terrain, grant, whole};
+use crate::script::{Coordinator, gated, start, start_with};
+use terrafarm_common::id::LeaseId;
+use terrafarm_common::region::{Region, columns};
+use terrafarm_wire::Message;
+use terrafarm_wire::message::{Drain, Ping, Pong, Role};
+use terrafarm_worker::Ended;
+
+#[tokio::test]
+async fn the_pixels_are_those_of_the_ray_caster_however_the_frame_is_cut() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let running = start(coordinator.config(None));
+    let mut peer = coordinator.welcome().await;
+    assert_eq!(peer.hello.name, "pc-1");
+    assert_eq!(peer.hello.role, Role::Worker { threads: 2, incarnation: 5 });
+    peer.send(terrain.open(1, 1)).await;
+    let mut regions = columns(SIZE.0, SIZE.1, &[1, 40, 41, 90]);
+    regions.push(whole());
+    regions.push(Region { x: 33, y: 17, width: 40, height: 5 });
+    for (number, region) in regions.iter().enumerate() {
+        peer.send(grant(number as u64, 1, *region)).await;
+    }
+    for (number, region) in regions.iter().enumerate() {
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        assert_eq!(done.lease, LeaseId(number as u64));
+        assert!(done.report.rays >= region.area());
+        let pixels = done.pixels.unpack(region.area() as usize * 3).unwrap();
+        assert!(pixels == terrain.expected(&grant(0, 1, *region), 1), "{region:?}");
+    }
+    let asked = peer.asked.len();
+    peer.asked.sort_unstable();
+    peer.asked.dedup();
+    assert!(asked >= 2 && peer.asked.len() == asked, "index and tiles, each once");
+    running.stop.send(()).unwrap();
+    assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
+    assert!(peer.recv().await.is_none(), "a clean end");
+    assert_eq!(running.ended.await.unwrap().unwrap(), Ended::Stopped);
+}
+
+#[tokio::test]
+async fn a_second_start_finds_its_terrain_on_disk() {
+    let terrain = Terrain::new();
+    let folder = tempfile::tempdir().unwrap();
+    let coordinator = Coordinator::new().await;
+    for first in [true, false] {
+        let running = start(coordinator.config(Some(folder.path())));
+        let mut peer = coordinator.welcome().await;
+        peer.send(terrain.open(1, 1)).await;
+        peer.send(grant(1, 1, whole())).await;
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        let pixels = done.pixels.unpack(whole().area() as usize * 3).unwrap();
+        assert!(pixels == terrain.expected(&grant(1, 1, whole()), 1));
+        assert_eq!(peer.asked.is_empty(), !first);
+        peer.send(Drain {}).await;
+        assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
+        assert_eq!(running.ended.await.unwrap().unwrap(), Ended::Drained);
+    }
+}
+
+#[tokio::test]
+async fn a_heartbeat_is_answered_while_a_job_renders() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let (caster, mut gate) = gated();
+    let running = start_with(coordinator.config(None), caster);
+    let mut peer = coordinator.welcome().await;
+    peer.send(terrain.open(1, 1)).await;
+    peer.send(grant(1, 1, Region { width: 32, height: 32, ..whole() })).await;
+    // The blobs it asks for must be served meanwhile.
+    peer.send(Ping { number: 1 }).await;
+    let mut pongs = 0;
+    while peer.asked.is_empty() || pongs == 0 {
+        tokio::select! {
+            message = peer.recv() => match message {
+                Some(Message::WantBlobs(want)) => {
+                    let hash = want.hashes[0];
+                    peer.asked.push(hash);
+                    let bytes = terrain.blobs[&hash].clone().into();
+                    peer.send(terrafarm_wire::message::Blob { hash, bytes }).await;
+                }
+                Some(Message::Pong(Pong { number: 1 })) => pongs += 1,
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+    gate.has_begun().await;
+    peer.send(Ping { number: 2 }).await;
+    assert_eq!(peer.recv().await, Some(Pong { number: 2 }.into()), "the job still renders");
+    gate.open(1);
+    assert!(matches!(peer.recv().await, Some(Message::Done(_))));
+    drop(running.stop);
+    running.ended.abort();
+}
+
+#[tokio::test]
+async fn on_shutdown_the_job_that_runs_is_finished_and_the_others_handed_back() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let (caster, mut gate) = gated();
+    let running = start_with(coordinator.config(None), caster);
+    let mut peer = coordinator.welcome().await;
+    let small = Region { width: 32, height: 32, ..whole() };
+    peer.send(terrain.open(1, 1)).await;
+    peer.send(grant(1, 1, small)).await;
+    peer.send(grant(2, 1, small)).await;
+    peer.send(grant(3, 1, small)).await;
+    peer.send(Ping { number: 7 }).await;
+    assert_eq!(peer.serve(&terrain).await, Some(Pong { number: 7 }.into()));
+    let begun = gate.has_begun();
+    let serving = peer.serve(&terrain);
+    // Serves the index; says nothing more until the worker is told to stop.
+    let handed_back = {
+        tokio::pin!(begun, serving);
+        tokio::select! {
+            () = &mut begun => {}
+            early = &mut serving => panic!("{early:?}"),
+        }
+        running.stop.send(()).unwrap();
+        serving.await
+    };
+    let Some(Message::HandBack(back)) = handed_back else { panic!("{handed_back:?}") };
+    assert_eq!(back.leases, [LeaseId(2), LeaseId(3)]);
+    gate.open(1);
+    let Some(Message::Done(done)) = peer.recv().await else { panic!("the first is finished") };
+    assert_eq!(done.lease, LeaseId(1));
+    assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
+    assert!(peer.recv().await.is_none());
+    assert_eq!(running.ended.await.unwrap().unwrap(), Ended::Stopped);
+}
