@@ -8,9 +8,9 @@ use terrafarm_common::region::Split;
 use terrafarm_sched::{Action, Config, Event, Micros, Scheduler};
 
 const WORKERS: u64 = 1000;
-const FRAMES: u32 = 10_000;
-/// Virtual time from a grant to its result, microseconds.
-const ANSWER_US: u64 = 20_000;
+const FRAMES: u32 = 5_000;
+/// Time of a job, microseconds: long enough that every job is one strip of columns.
+const JOB_US: u64 = 200_000;
 
 fn main() {
     let mut scheduler = Scheduler::new(Config::default(), 1);
@@ -38,7 +38,8 @@ fn main() {
         while let Some(action) = scheduler.poll_action() {
             match action {
                 Action::Grant { worker, lease, .. } => {
-                    answers.push_back((now + ANSWER_US, worker, lease));
+                    // The one before it at the same worker is done first.
+                    answers.push_back((now + 2 * JOB_US, worker, lease));
                 }
                 Action::FrameComplete { shot, frame } => taken.push((shot, frame)),
                 Action::ShotComplete { .. } => is_over = true,
@@ -53,8 +54,7 @@ fn main() {
         }
         let Some((at, worker, lease)) = answers.pop_front() else { continue };
         now = at.max(now);
-        let cost_us = ANSWER_US / 2;
-        scheduler.handle(Micros(now), Event::JobDone { worker, lease, cost_us });
+        scheduler.handle(Micros(now), Event::JobDone { worker, lease, cost_us: JOB_US });
     }
     let jobs = scheduler.account().accepted;
     let seconds = began.elapsed().as_secs_f64();

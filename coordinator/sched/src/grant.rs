@@ -226,7 +226,9 @@ impl Scheduler {
         let job = shot.running.get(&(lease.frame, lease.start));
         lease.worker != worker
             && !shot.blocked.contains(&worker)
-            && job.is_some_and(|job| !job.failed_on.contains(&worker))
+            && job.is_some_and(|job| {
+                !job.failed_on.contains(&worker) || job.expiries >= HOPELESS_EXPIRIES
+            })
     }
 
     fn copy(&mut self, worker: WorkerId, lease: LeaseId) {

@@ -188,11 +188,15 @@ impl Scheduler {
         let now = self.now;
         let Some(known) = self.workers.get_mut(&worker) else { return };
         known.head_deadline = None;
-        known.is_suspect = true;
         let before = known.speed.value();
-        if let Some(head) = known.held.front().and_then(|head| self.leases.held.get(head)) {
+        // Only the first of several expiries in a row is a measurement. A worker that does
+        // nothing at all would else seem ever slower, and its leases last ever longer.
+        if !known.is_suspect
+            && let Some(head) = known.held.front().and_then(|head| self.leases.held.get(head))
+        {
             known.speed.learn_overdue(head.cost, now.since(known.head_since) as f64);
         }
+        known.is_suspect = true;
         if !known.is_draining {
             self.active_speed += known.speed.value() - before;
         }

@@ -319,8 +319,12 @@ impl Scheduler {
             self.actions.push_back(Action::Probe { worker });
             self.now.after(heartbeat_us).min(heard_at.after(allowed_us))
         };
-        // One microsecond at least, so that a heartbeat of 0 cannot hold the clock.
-        self.timers.insert((next_at.max(self.now.after(1)), Timer::Beat(worker)));
+        // One microsecond at least, so that a heartbeat of 0 cannot hold the clock; and at
+        // the end of time nothing is due any more.
+        let next_at = next_at.max(self.now.after(1));
+        if next_at > self.now {
+            self.timers.insert((next_at, Timer::Beat(worker)));
+        }
     }
 
     /// Brings a shot's place among the ready ones up to date.

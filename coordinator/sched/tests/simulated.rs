@@ -23,17 +23,19 @@ fn run(config: &SimConfig) -> SimReport {
 }
 
 #[test]
-fn thirty_one_mixed_workers_are_used_to_98_percent() {
+fn thirty_one_mixed_workers_are_used_to_99_percent() {
     for seed in 1..=5 {
         let report = run(&SimConfig::for_workers(31, seed));
-        assert!(report.efficiency >= 0.98, "{report:?}");
+        // Measured: 0.9989 to 0.9997.
+        assert!(report.efficiency >= 0.99, "{report:?}");
     }
 }
 
 #[test]
-fn a_thousand_mixed_workers_are_used_to_95_percent() {
+fn a_thousand_mixed_workers_are_used_to_97_percent() {
     let report = run(&SimConfig::for_workers(1000, 1));
-    assert!(report.efficiency >= 0.95, "{report:?}");
+    // Measured: 0.9865.
+    assert!(report.efficiency >= 0.97, "{report:?}");
 }
 
 /// A small farm in which a random mixture of everything goes wrong.
@@ -101,6 +103,16 @@ fn when_jobs_fail_every_frame_completes_or_fails_by_name() {
 }
 
 #[test]
+fn a_stuck_worker_does_not_keep_the_last_job_from_the_one_that_failed_at_it_once() {
+    // Two nights that never ended: the only healthy worker was blocked (214) or had failed
+    // at the job before (579), and the stuck one got ever longer leases.
+    for seed in [214, 579] {
+        let report = run(&bad_night(seed, true));
+        assert!(report.makespan_s < 600.0, "{report:?}");
+    }
+}
+
+#[test]
 fn the_same_seed_gives_the_same_run() {
     for seed in [3, 14, 15] {
         let config = bad_night(seed, true);
@@ -121,13 +133,15 @@ fn deaths_in_the_middle_cost_little_more_than_their_share() {
     };
     let report = run(&SimConfig { faults, ..SimConfig::for_workers(31, 4) });
     assert!(report.account.lost > 0);
+    // Measured: 0.9793; 0.9997 without the deaths.
     assert!(report.efficiency >= 0.95, "{report:?}");
 }
 
 #[test]
 fn fixed_tiles_use_the_farm_as_well() {
     let report = run(&SimConfig { split: Split::Tiles(64), ..SimConfig::for_workers(31, 2) });
-    assert!(report.efficiency >= 0.97, "{report:?}");
+    // Measured: 0.9714; the rest is the simulated set-up time of half a million jobs.
+    assert!(report.efficiency >= 0.96, "{report:?}");
 }
 
 #[test]

@@ -118,7 +118,7 @@ impl<'a> World<'a> {
                 }
             }
             events += 1;
-            if self.config.check_every > 0 && events % self.config.check_every == 0 {
+            if self.config.check_every > 0 && events.is_multiple_of(self.config.check_every) {
                 self.judge.self_checked(self.scheduler.check_invariants());
             }
         }
