@@ -158,7 +158,11 @@ impl Scheduler {
             .get(&lease.shot)
             .and_then(|shot| shot.running.get(&(lease.frame, lease.start)));
         let doublings = job.map_or(0, |job| job.expiries).min(MAX_DOUBLINGS);
-        let allowed = own_us as f64 * self.config.lease_factor + self.config.lease_floor_us as f64;
+        // A suspect's speed is a guess from doing nothing: it gets no longer than the others.
+        let average = self.active_speed / self.active.max(1) as f64;
+        let usual_us = if known.is_suspect { lease.cost / average } else { f64::INFINITY };
+        let allowed = usual_us.min(own_us as f64) * self.config.lease_factor
+            + self.config.lease_floor_us as f64;
         let allowed_us = (allowed * f64::from(1 << doublings)) as u64;
         let deadline = self.now.after(allowed_us.max(1));
         lease.expected_at = self.now.after(own_us);

@@ -13,7 +13,7 @@ const MAX_FAULTS: u32 = 3;
 const MAX_LEADING_FAILURES: u32 = 16;
 /// A job that expired so often is given to anyone: those trusted with it do no better than
 /// those that failed.
-pub(crate) const HOPELESS_EXPIRIES: u32 = 2;
+pub(crate) const HOPELESS_EXPIRIES: u32 = 1;
 /// The largest time a result may claim, microseconds: a day.
 const MAX_COST_US: u64 = 86_400_000_000;
 
@@ -181,6 +181,7 @@ impl Scheduler {
         for worker in std::mem::take(&mut shot.blocked) {
             self.actions.push_back(Action::Unblocked { worker, shot: id });
         }
+        self.unpark();
     }
 
     /// A worker has had its first job for too long: all it holds waits for others.
@@ -227,18 +228,18 @@ impl Scheduler {
         let Some(job) = shot.running.get_mut(&key) else { return };
         job.leases.retain(|&held| held != id);
         job.expiries += u32::from(end == End::Expired);
+        let is_hopeless = end == End::Expired && job.expiries >= HOPELESS_EXPIRIES;
         if let Some(&other) = job.leases.first() {
             self.refresh_hedgeable(other);
         } else if let Some(job) = shot.running.remove(&key)
             && end != End::Unwanted
         {
-            let is_hopeless = job.expiries >= HOPELESS_EXPIRIES;
             shot.waiting.insert(key, job);
-            if is_hopeless {
-                self.unblock_all(lease.shot);
-            }
             self.refresh_ready(lease.shot);
             self.unpark();
+        }
+        if is_hopeless {
+            self.unblock_all(lease.shot);
         }
     }
 

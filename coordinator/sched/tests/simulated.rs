@@ -104,9 +104,9 @@ fn when_jobs_fail_every_frame_completes_or_fails_by_name() {
 
 #[test]
 fn a_stuck_worker_does_not_keep_the_last_job_from_the_one_that_failed_at_it_once() {
-    // Two nights that never ended: the only healthy worker was blocked (214) or had failed
-    // at the job before (579), and the stuck one got ever longer leases.
-    for seed in [214, 579] {
+    // Nights that never ended: the only healthy worker was blocked (214, 3099) or had
+    // failed at the job before (579), and the stuck ones got ever longer leases.
+    for seed in [214, 579, 3099] {
         let report = run(&bad_night(seed, true));
         assert!(report.makespan_s < 600.0, "{report:?}");
     }
