@@ -3,6 +3,7 @@
 use anyhow::Context;
 use std::net::SocketAddr;
 use std::process::Stdio;
+use std::sync::Arc;
 use std::time::Duration;
 use terrafarm_coordinator::Config;
 use tokio::net::TcpListener;
@@ -20,6 +21,8 @@ const RESTART_PAUSE: Duration = Duration::from_millis(200);
 pub struct LocalFarm {
     /// Address of its coordinator.
     pub address: SocketAddr,
+    /// Cancelled when the last worker has ended for good: nobody is left to render.
+    pub deserted: CancellationToken,
     stop: CancellationToken,
     parts: JoinSet<anyhow::Result<()>>,
 }
@@ -52,6 +55,9 @@ impl LocalFarm {
             .context("cannot listen on the loopback address; is networking disabled here?")?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
         let stop = CancellationToken::new();
+        let deserted = CancellationToken::new();
+        // The last clone to be dropped is that of the last worker.
+        let leaving = Arc::new(deserted.clone().drop_guard());
         let mut parts = JoinSet::new();
         let until = stop.clone();
         parts.spawn(async move {
@@ -64,9 +70,14 @@ impl LocalFarm {
             // The first start is checked here, so that a missing program is an error at
             // once and not a farm without workers.
             let child = start_worker(address, number, crew.threads)?;
-            parts.spawn(keep_alive(child, address, number, crew.threads, until));
+            let present = leaving.clone();
+            parts.spawn(async move {
+                let ended = keep_alive(child, address, number, crew.threads, until).await;
+                drop(present);
+                ended
+            });
         }
-        Ok(LocalFarm { address, stop, parts })
+        Ok(LocalFarm { address, deserted, stop, parts })
     }
 
     /// Ends workers and coordinator, and waits for them.

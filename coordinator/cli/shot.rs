@@ -213,8 +213,20 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         cameras: plan.cameras.clone(),
         frames_in_flight: plan.frames_in_flight,
     };
+    let deserted = farm.as_ref().map_or_else(CancellationToken::new, |farm| farm.deserted.clone());
+    let give_up = tokio::spawn({
+        let (deserted, stop) = (deserted.clone(), stop.clone());
+        async move {
+            deserted.cancelled().await;
+            stop.cancel();
+        }
+    });
     let rendered = client::render(&address, submission, updates, taken_out, stop).await;
     interrupt.abort();
+    give_up.abort();
+    if deserted.is_cancelled() && rendered.is_err() {
+        bail!("every local worker ended and would not start again; their messages stand above");
+    }
     if let Some(farm) = farm {
         farm.stop().await;
     }

@@ -105,12 +105,14 @@ pub async fn serve(
     }
     // Workers are the scheduler's to watch, which probes them. A client pings by itself;
     // one that is silent for so long is gone, and its shots hold the farm for nobody.
-    let patience = if is_worker { Duration::MAX } else { admission.silence * CLIENT_PATIENCE };
+    let patience = admission.silence * CLIENT_PATIENCE;
     let mut leaving = false;
     let how = loop {
         tokio::select! {
             () = hang_up.cancelled() => break Ok(()),
-            received = reader.recv_within(patience) => match received {
+            received = async {
+                if is_worker { reader.recv().await } else { reader.recv_within(patience).await }
+            } => match received {
                 Ok(Some(message)) => {
                     leaving |= matches!(message, Message::Goodbye(_));
                     let event = ToDriver::Event(peer, PeerEvent::Said(message));
