@@ -26,6 +26,8 @@ pub enum Command {
     /// Make, inspect and sample terrain stores
     #[command(subcommand)]
     Terrain(Terrain),
+    /// Print a scene file with every key, its range and its default
+    Scene,
     /// Render a flight over a scene to a video or to pictures
     Render(Render),
     /// Serve a farm: workers and renders connect here

@@ -5,10 +5,10 @@ use std::net::SocketAddr;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
-use terrafarm_coordinator::Config;
+use terrafarm_coordinator::{Config, CoordinatorError};
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};
-use tokio::task::JoinSet;
+use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 /// A worker that dies is started again at most so often; one that keeps dying has a
@@ -23,8 +23,10 @@ pub struct LocalFarm {
     pub address: SocketAddr,
     /// Cancelled when the last worker has ended for good: nobody is left to render.
     pub deserted: CancellationToken,
-    stop: CancellationToken,
-    parts: JoinSet<anyhow::Result<()>>,
+    stop_workers: CancellationToken,
+    stop_coordinator: CancellationToken,
+    workers: JoinSet<anyhow::Result<()>>,
+    coordinator: JoinHandle<Result<(), CoordinatorError>>,
 }
 
 /// How many workers of how many threads.
@@ -54,36 +56,43 @@ impl LocalFarm {
             .await
             .context("cannot listen on the loopback address; is networking disabled here?")?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
-        let stop = CancellationToken::new();
+        let (stop_workers, stop_coordinator) = (CancellationToken::new(), CancellationToken::new());
         let deserted = CancellationToken::new();
         // The last clone to be dropped is that of the last worker.
         let leaving = Arc::new(deserted.clone().drop_guard());
-        let mut parts = JoinSet::new();
-        let until = stop.clone();
-        parts.spawn(async move {
-            let config = Config { name: "local".into(), ..Config::default() };
-            terrafarm_coordinator::run(config, listener, until.cancelled_owned()).await?;
-            Ok(())
-        });
+        let config = Config { name: "local".into(), ..Config::default() };
+        let until = stop_coordinator.clone().cancelled_owned();
+        let coordinator = tokio::spawn(terrafarm_coordinator::run(config, listener, until));
+        let mut workers = JoinSet::new();
         for number in 1..=crew.workers {
-            let until = stop.clone();
+            let until = stop_workers.clone();
             // The first start is checked here, so that a missing program is an error at
             // once and not a farm without workers.
             let child = start_worker(address, number, crew.threads)?;
             let present = leaving.clone();
-            parts.spawn(async move {
+            workers.spawn(async move {
                 let ended = keep_alive(child, address, number, crew.threads, until).await;
                 drop(present);
                 ended
             });
         }
-        Ok(LocalFarm { address, deserted, stop, parts })
+        Ok(LocalFarm {
+            address,
+            deserted,
+            stop_workers,
+            stop_coordinator,
+            workers,
+            coordinator,
+        })
     }
 
     /// Ends workers and coordinator, and waits for them.
     pub async fn stop(mut self) {
-        self.stop.cancel();
-        while self.parts.join_next().await.is_some() {}
+        // Workers first: one that loses its coordinator would complain.
+        self.stop_workers.cancel();
+        while self.workers.join_next().await.is_some() {}
+        self.stop_coordinator.cancel();
+        let _ = self.coordinator.await;
     }
 }
 

@@ -233,7 +233,7 @@ fn coordinator_survives(bytes: &[u8]) {
             .args(["--size", "64x36", "--frames", "0..2", "--coordinator", &address, "-o"])
             .arg(world.dir.path("out")),
     );
-    good.expect("job begun");
+    good.expect("job begins");
     let (code, lines) = render.finish();
     assert_eq!(code, Some(0), "{lines:#?}");
 }

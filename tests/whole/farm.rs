@@ -56,7 +56,7 @@ fn frames_survive_kill_9_of_a_worker_and_of_its_replacement() {
         let mut victim = worker(&address, name);
         // In the middle of a frame: some of its jobs are done, the next one has begun.
         for _ in 0..5 {
-            victim.expect("job begun");
+            victim.expect("job begins");
         }
         victim.kill();
     }
@@ -73,7 +73,7 @@ fn a_silent_worker_is_noticed_within_5_seconds_and_its_late_result_refused() {
     let (mut coordinator, address) = coordinator();
     let (calm, render) = undisturbed_and_on_farm(&world, &address);
     let mut silent = worker(&address, "silent");
-    silent.expect("job begun");
+    silent.expect("job begins");
     silent.signal("STOP");
     let since = Instant::now();
     coordinator.expect("silent");
@@ -136,7 +136,7 @@ fn a_cut_connection_is_noticed_at_once() {
     let (calm, render) = undisturbed_and_on_farm(&world, &address);
     let cable = Cable::to(&address);
     let mut far = worker(&cable.address, "far");
-    far.expect("job begun");
+    far.expect("job begins");
     cable.cut();
     let since = Instant::now();
     coordinator.expect("worker lost");
@@ -153,9 +153,9 @@ fn a_worker_that_comes_in_mid_shot_is_used() {
     let (_coordinator, address) = coordinator();
     let (_, render) = undisturbed_and_on_farm(&world, &address);
     let mut first = worker(&address, "first");
-    first.expect("job begun");
+    first.expect("job begins");
     let mut second = worker(&address, "second");
-    second.expect("job begun");
+    second.expect("job begins");
     let (code, lines) = render.finish();
     assert_eq!(code, Some(0), "{lines:#?}");
     let manifest = std::fs::read_to_string(world.dir.path("farm").join("manifest.json")).unwrap();
@@ -176,7 +176,7 @@ fn a_worker_that_is_told_to_stop_hands_its_jobs_back() {
     let (mut coordinator, address) = coordinator();
     let (calm, render) = undisturbed_and_on_farm(&world, &address);
     let mut leaving = worker(&address, "leaving");
-    leaving.expect("job begun");
+    leaving.expect("job begins");
     #[cfg(unix)]
     leaving.signal("TERM");
     #[cfg(not(unix))]

@@ -11,12 +11,17 @@ pub use serve::stop_signal;
 
 use crate::Outcome;
 use crate::args::Command;
+use crate::input::scene::Scene;
 
 /// Carries out a command.
 pub fn run(command: Command) -> anyhow::Result<Outcome> {
     match command {
         Command::Demo(args) => demo::run(&args),
         Command::Terrain(args) => terrain::run(args),
+        Command::Scene => {
+            print!("{}", Scene::example());
+            Ok(Outcome::Done)
+        }
         Command::Render(args) => render::run(&args),
         Command::Coordinator(args) => serve::coordinator(&args),
         Command::Worker(args) => serve::worker(args),
