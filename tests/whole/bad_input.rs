@@ -33,7 +33,7 @@ fn an_hgt_of_the_wrong_size_names_the_sizes_it_may_have() {
 
 #[test]
 fn a_short_ascii_grid_says_how_many_values_are_missing() {
-    let text = "ncols 3\nnrows 3\nxllcorner 500000\nyllcorner 5000000\ncellsize 10\n1 2 3\n4 5 6\n";
+    let text = "ncols 3\nnrows 3\nxllcorner 500000\nyllcorner 5000000\ncellsize 10\n100 200 300\n400 500 600\n";
     import_fails("short.asc", text.as_bytes(), &["--source-crs", "EPSG:32633"], &["9", "6"]);
 }
 
@@ -135,12 +135,12 @@ fn render_fails(flight: &str, said: &[&str]) {
 
 #[test]
 fn an_unknown_column_is_named_with_its_line() {
-    render_fails("t,x,y,z,heading,pich\n0,1,1,1,0,0\n", &["flight.csv", "line 1", "pich", "pitch"]);
+    render_fails("t,x,y,z,heading,pich\n0,1,1,1,0,0\n", &["flight.csv:1", "pich", "pitch"]);
 }
 
 #[test]
 fn a_number_that_is_none_is_named_with_its_line_and_column() {
-    render_fails("t,x,y,z,heading,pitch\n0,1,1,1,0,0\n1,1,nan,1,0,0\n", &["line 3", "y"]);
+    render_fails("t,x,y,z,heading,pitch\n0,1,1,1,0,0\n1,1,nan,1,0,0\n", &["flight.csv:3", "\"y\""]);
 }
 
 #[test]
