@@ -31,6 +31,7 @@ pub enum Peer {
 
 /// Something that happened at a connection.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "nearly every event is a message")]
 pub enum PeerEvent {
     /// The handshake is over.
     Joined(Greeting),

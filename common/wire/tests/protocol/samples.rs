@@ -118,6 +118,7 @@ pub fn all() -> Vec<(String, Message)> {
             jobs_repeated: 3,
             elapsed_us: 1,
             report: report(),
+            workers: vec![WorkerShare { name: text(), jobs: 36_000, cost_us: 7 }],
         }
         .into(),
         ShotFailed { shot, reason: text() }.into(),
