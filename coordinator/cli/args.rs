@@ -116,6 +116,10 @@ pub struct Import {
     /// Reference system of files that do not say theirs
     #[arg(long)]
     pub source_crs: Option<String>,
+    /// Distance between posts, metres [default: that of the finest input, or a little
+    /// less where it has to be resampled]
+    #[arg(long, value_name = "METRES")]
+    pub spacing: Option<f64>,
     /// Fill voids up to this many posts wide from their rim
     #[arg(long, value_name = "POSTS")]
     pub fill_voids: Option<u32>,

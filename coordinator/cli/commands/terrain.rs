@@ -67,6 +67,7 @@ fn import(args: &args::Import) -> anyhow::Result<()> {
         settings: ImportSettings {
             crs: args.crs.clone(),
             source_crs: args.source_crs.clone(),
+            spacing_m: args.spacing,
             fill_voids: args.fill_voids,
             elevation_options,
             photo_options,
@@ -110,7 +111,10 @@ fn print_import(args: &args::Import, done: &ImportSummary) -> anyhow::Result<()>
     }
     let error = match done.report.max_resampling_error_m {
         0.0 => "every post untouched".to_owned(),
-        error => format!("largest resampling error {error:.2} m"),
+        error => format!(
+            "largest resampling error {error:.2} m, rms {:.2} m (a smaller --spacing makes it less)",
+            done.report.rms_resampling_error_m
+        ),
     };
     println!("{}: {}, {error}", args.output.display(), done.crs);
     println!("look at it:  terrafarm terrain hillshade {0} -o hillshade.png", args.output.display());

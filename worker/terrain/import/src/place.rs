@@ -107,7 +107,8 @@ pub(crate) fn native_spacing(mosaic: &Mosaic, crs: &Crs) -> Result<[f64; 2], Imp
 
 /// The grid of a layer that takes its posts from mosaics: the samples of the finest, if
 /// they lie upright in the store's system; else a friendly spacing not above the finest
-/// native one, at multiples of it, so that neighbouring imports line up.
+/// native one, or the one that is `wanted`, at multiples of it, so that neighbouring
+/// imports line up.
 ///
 /// # Errors
 /// If the grid would be too large, or has no size.
@@ -115,6 +116,7 @@ pub(crate) fn plan_grid(
     mosaics: &[(Mosaic, [f64; 4])],
     crs: &Crs,
     clip: Option<[f64; 4]>,
+    wanted: Option<f64>,
 ) -> Result<Grid, ImportError> {
     let mut finest: Option<(f64, &Mosaic)> = None;
     for (mosaic, _) in mosaics {
@@ -146,11 +148,11 @@ pub(crate) fn plan_grid(
         ];
     }
     let kept = finest.frame.is_upright() && finest.crs.is_same_grid(crs);
-    let (phase, spacing) = if kept {
-        let spacing = [finest.frame.column[0].abs(), finest.frame.row[1].abs()];
-        (finest.frame.origin, spacing)
-    } else {
-        ([0.0; 2], [friendly_spacing(least); 2])
+    let own = [finest.frame.column[0].abs(), finest.frame.row[1].abs()];
+    let (phase, spacing) = match wanted {
+        Some(wanted) if !(kept && own == [wanted; 2]) => ([0.0; 2], [wanted; 2]),
+        _ if kept => (finest.frame.origin, own),
+        _ => ([0.0; 2], [friendly_spacing(least); 2]),
     };
     Grid::covering(phase, spacing, bounds).map_err(ImportError::Request)
 }

@@ -18,6 +18,9 @@ use crate::surface::{MAX_FILL_POSTS, StackedMosaic, Way};
 const SAME_RESOLUTION: f64 = 1.5;
 /// Largest departure from true scale that is accepted without being asked for.
 const TRUE_SCALE: f64 = 0.02;
+/// The nearest and the farthest that posts may be asked to be, metres.
+const MIN_SPACING_M: f64 = 0.001;
+const MAX_SPACING_M: f64 = 100_000.0;
 /// Sides of insets that are nearer than this, in samples, belong to one layer.
 const TOUCHING: f64 = 1.5;
 
@@ -78,12 +81,12 @@ impl Plan {
             warnings.extend(info.warnings.iter().chain(systems).map(|w| format!("{name}: {w}")));
         }
         warnings.dedup();
-        let base = plan_layer(base, &crs, None, 0)?;
+        let base = plan_layer(base, &crs, None, 0, wanted_spacing(settings)?)?;
         warn_of_scale(&crs, base.grid, &mut warnings)?;
         let mut inset_layers = Vec::new();
         for mosaics in touching(insets, &crs)? {
             refuse_thin(&mosaics)?;
-            let layer = plan_layer(mosaics, &crs, None, 1)?;
+            let layer = plan_layer(mosaics, &crs, None, 1, None)?;
             refuse_apart(&layer, &base, &crs)?;
             inset_layers.push(layer);
         }
@@ -96,7 +99,7 @@ impl Plan {
             for mosaic in &mosaics {
                 refuse_photo_apart(mosaic, &base, &crs)?;
             }
-            photo_layers.push(plan_layer(mosaics, &crs, Some(base.grid.bounds()), 0)?);
+            photo_layers.push(plan_layer(mosaics, &crs, Some(base.grid.bounds()), 0, None)?);
         }
         let mut plan = Plan {
             crs,
@@ -302,6 +305,18 @@ fn warn_of_scale(crs: &Crs, grid: Grid, warnings: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
+/// The distance between posts that the user asks for.
+fn wanted_spacing(settings: &ImportSettings) -> Result<Option<f64>, ImportError> {
+    match settings.spacing_m {
+        Some(spacing) if !(MIN_SPACING_M..=MAX_SPACING_M).contains(&spacing) => {
+            Err(ImportError::Request(format!(
+                "posts {spacing} m apart make no terrain; choose {MIN_SPACING_M} to {MAX_SPACING_M}"
+            )))
+        }
+        wanted => Ok(wanted),
+    }
+}
+
 /// Puts mosaics over one another on a common grid, cut to `clip` and grown by a ring of
 /// so many posts.
 fn plan_layer(
@@ -309,13 +324,14 @@ fn plan_layer(
     crs: &Crs,
     clip: Option<[f64; 4]>,
     ring: u64,
+    wanted: Option<f64>,
 ) -> Result<PlannedLayer, ImportError> {
     let mut bounded = Vec::with_capacity(mosaics.len());
     for mosaic in mosaics {
         let bounds = bounds_in(&mosaic, crs, &path_of(&mosaic))?;
         bounded.push((mosaic, bounds));
     }
-    let grid = plan_grid(&bounded, crs, clip)?.grown(ring);
+    let grid = plan_grid(&bounded, crs, clip, wanted)?.grown(ring);
     stack_on(grid, bounded, crs)
 }
 

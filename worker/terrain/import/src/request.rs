@@ -32,6 +32,9 @@ pub struct ImportSettings {
     pub crs: Option<String>,
     /// Reference system of rasters that do not name theirs.
     pub source_crs: Option<String>,
+    /// Distance between posts of the base heights, metres. `None`: that of the finest
+    /// input, or a little less where it has to be resampled.
+    pub spacing_m: Option<f64>,
     /// Fills voids that have a valid post within so many posts; at most
     /// [`crate::MAX_FILL_POSTS`]. `None`: voids stay voids.
     pub fill_voids: Option<u32>,

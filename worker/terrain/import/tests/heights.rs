@@ -45,6 +45,23 @@ fn posts_on_the_stores_grid_are_taken_bit_for_bit() {
 }
 
 #[test]
+fn a_spacing_that_is_asked_for_is_used_and_its_own_is_no_resampling() {
+    let raster = || {
+        MemoryRaster::heights(UTM, [300_015.5, 4_100_000.25], [30.0, 30.0], [60, 30], noise)
+    };
+    let with = |spacing| ImportSettings { spacing_m: Some(spacing), ..plain() };
+    let finer = import(sources(vec![raster()]), &with(12.5));
+    assert_eq!(finer.layer(0).spacing, [12.5; 2]);
+    assert!(finer.summary.report.max_resampling_error_m > 0.0);
+    let own = import(sources(vec![raster()]), &with(30.0));
+    assert_eq!(own.summary.report.max_resampling_error_m, 0.0);
+    for wrong in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        let error = error_of(sources(vec![raster()]), &with(wrong));
+        assert!(error.contains("apart"), "{error}");
+    }
+}
+
+#[test]
 fn south_up_and_mirrored_rasters_are_turned_untouched() {
     for (sx, sy) in [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)] {
         let transform = GeoTransform {
