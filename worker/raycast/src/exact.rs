@@ -25,7 +25,7 @@ use crate::grid::GridRay;
 use crate::path::{Path, Span};
 use crate::pyramid::LayerMaxima;
 use terrafarm_terrain::layout::{TILE_CELLS, TileKey};
-use terrafarm_terrain::tile::MAXIMA_LEVELS;
+use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
 
 /// How far above a block's maximum a ray must stay for the block to be skipped, metres.
 /// Rounding in heights and positions is below 1e-8 m; a skip lost to it costs nothing.
@@ -44,14 +44,18 @@ pub(crate) struct Exact<'a> {
     pub steps: u64,
 }
 
-/// What a walk over one stretch needs at every step.
+/// A walk over one stretch.
 struct Walk<'w> {
     path: &'w Path,
-    ray: &'w GridRay,
+    ray: GridRay,
     maxima: &'w LayerMaxima,
     layer: usize,
+    /// 1 along an axis on which the index of the cell grows, else 0.
+    ahead: [i32; 2],
     stretch: Stretch,
     span: Span,
+    /// Where the span or the stretch ends, whichever is first.
+    limit: f64,
     cell: [i32; 2],
     /// How far the ray is known to be free ...
     u: f64,
@@ -61,12 +65,15 @@ struct Walk<'w> {
 }
 
 /// The end of the way through a block.
+#[derive(Clone, Copy)]
 struct Exit {
     /// Where the ray leaves the block, or the span or the stretch ends.
     u: f64,
     z: f64,
-    /// The axis whose line is crossed, if one is.
-    axis: Option<usize>,
+    /// The axis whose line is crossed.
+    axis: usize,
+    /// The span or the stretch ends before a line is crossed.
+    ends: bool,
 }
 
 impl<'a> Exact<'a> {
@@ -95,7 +102,7 @@ impl<'a> Exact<'a> {
                 continue;
             }
             let (layer, ray) = &rays[stretch.ray];
-            match self.walk(Walk::new(self.field, path, *layer, ray, stretch, free_u)) {
+            match self.walk(Walk::new(self.field, path, *layer, *ray, stretch, free_u)) {
                 Outcome::Miss => {}
                 Outcome::Unfinished => finished = false,
                 hit => {
@@ -109,56 +116,61 @@ impl<'a> Exact<'a> {
     }
 
     fn walk(&mut self, mut walk: Walk) -> Outcome {
+        let highest = self.field.pyramid.highest();
         let mut finished = true;
-        loop {
-            self.steps += 1;
-            if walk.span.leaves_above(self.field.pyramid.highest()) {
-                break;
-            }
+        let mut steps = 0;
+        while !walk.span.leaves_above(highest) {
+            steps += 1;
             let ground = if walk.level < MAXIMA_LEVELS {
                 self.ground(walk.layer, walk.cell)
             } else {
                 Ground::Void
             };
             let going_on = match ground {
-                Ground::Loaded(tile) if walk.level == 0 => {
-                    let corners = corners_in(tile, walk.cell);
-                    match corners.and_then(|corners| walk.contact(&corners)) {
-                        Some(_) if !finished => break,
-                        Some(contact) => return Outcome::Hit(contact),
-                        None => walk.pass(walk.exit(0)),
-                    }
-                }
-                Ground::Loaded(tile) => {
+                Ground::Loaded(tile) if walk.level > 0 => {
                     let [bi, bj] =
                         walk.cell.map(|index| (index as usize & (TILE_CELLS - 1)) >> walk.level);
-                    let max = tile.block_max(walk.level, bi, bj);
-                    walk.pass_or_descend(max)
+                    walk.pass_or_descend(tile.block_max(walk.level, bi, bj))
                 }
-                Ground::Absent => {
-                    finished = false;
-                    let key = tile_key(walk.layer, walk.cell);
-                    self.wanted.add(key);
-                    let exit = walk.exit(MAXIMA_LEVELS);
-                    let entry = self.field.index().entry(key);
-                    // Below everything that the tile holds, the ray most likely ends in it.
-                    if entry.is_none_or(|entry| exit.z < f64::from(entry.min)) {
-                        break;
+                Ground::Loaded(tile) => match walk.contact(tile) {
+                    Some(_) if !finished => break,
+                    Some(contact) => {
+                        self.steps += steps;
+                        return Outcome::Hit(contact);
                     }
-                    walk.level = MAXIMA_LEVELS;
-                    walk.pass(exit)
-                }
+                    None => walk.pass(walk.exit(0)),
+                },
                 Ground::Void if walk.level < MAXIMA_LEVELS => walk.pass(walk.exit(walk.level)),
                 Ground::Void => {
                     let [bi, bj] = walk.cell.map(|index| index as usize >> walk.level);
                     walk.pass_or_descend(walk.maxima.block_max(walk.level, bi, bj))
+                }
+                Ground::Absent => {
+                    finished = false;
+                    self.pass_absent(&mut walk)
                 }
             };
             if !going_on {
                 break;
             }
         }
+        self.steps += steps;
         if finished { Outcome::Miss } else { Outcome::Unfinished }
+    }
+
+    /// Goes on behind a tile that is not loaded, if the ray may see what lies there.
+    #[cold]
+    fn pass_absent(&mut self, walk: &mut Walk) -> bool {
+        let key = tile_key(walk.layer, walk.cell);
+        self.wanted.add(key);
+        let exit = walk.exit(MAXIMA_LEVELS);
+        // Below everything that the tile holds, the ray most likely ends in it.
+        let lowest = self.field.index().entry(key).map(|entry| f64::from(entry.min));
+        if lowest.is_none_or(|lowest| exit.z < lowest) {
+            return false;
+        }
+        walk.level = MAXIMA_LEVELS;
+        walk.pass(exit)
     }
 
     #[inline]
@@ -172,11 +184,12 @@ impl<'a> Exact<'a> {
 }
 
 impl<'w> Walk<'w> {
+    #[inline(always)]
     fn new(
         field: Field<'w>,
         path: &'w Path,
         layer: usize,
-        ray: &'w GridRay,
+        ray: GridRay,
         stretch: Stretch,
         free_u: f64,
     ) -> Self {
@@ -188,8 +201,10 @@ impl<'w> Walk<'w> {
             ray,
             maxima,
             layer,
+            ahead: [i32::from(ray.forward[0]), i32::from(ray.forward[1])],
             stretch,
             span,
+            limit: stretch.end_u.min(span.end_u),
             cell: [ray.cell_after(0, u), ray.cell_after(1, u)],
             u,
             z: span.z(u),
@@ -200,31 +215,23 @@ impl<'w> Walk<'w> {
     /// Where the ray leaves the block of a level that holds the cell.
     #[inline(always)]
     fn exit(&self, level: usize) -> Exit {
-        let [x_u, y_u] = [0, 1].map(|axis| {
-            let block = self.cell[axis] >> level;
-            let line = if self.ray.forward[axis] {
-                ((block + 1) << level).min(self.ray.cells[axis])
-            } else {
-                block << level
-            };
+        let line_u = |axis: usize| {
+            let line = ((self.cell[axis] >> level) + self.ahead[axis]) << level;
             self.ray.line_u(axis, line)
-        });
-        let limit = self.stretch.end_u.min(self.span.end_u);
-        let (line_u, axis) = if x_u <= y_u { (x_u, 0) } else { (y_u, 1) };
-        if line_u < limit {
-            Exit { u: line_u, z: self.span.z(line_u), axis: Some(axis) }
-        } else {
-            Exit { u: limit, z: self.span.z(limit), axis: None }
-        }
+        };
+        let (x_u, y_u) = (line_u(0), line_u(1));
+        let axis = usize::from(y_u < x_u);
+        let line_u = if y_u < x_u { y_u } else { x_u };
+        let ends = line_u >= self.limit;
+        let u = if ends { self.limit } else { line_u };
+        Exit { u, z: self.span.z(u), axis, ends }
     }
 
     /// Passes the block if the ray clears its maximum, else looks closer.
     #[inline(always)]
     fn pass_or_descend(&mut self, max: f32) -> bool {
         let exit = self.exit(self.level);
-        let length = exit.u - self.u;
-        let sag = 0.25 * self.span.bend * length * length;
-        if self.z.min(exit.z) - sag > f64::from(max) + CLEARANCE_M {
+        if self.lowest(&exit) > f64::from(max) + CLEARANCE_M {
             self.pass(exit)
         } else {
             self.level -= 1;
@@ -232,47 +239,62 @@ impl<'w> Walk<'w> {
         }
     }
 
+    /// A lower bound of the ray's height up to an exit.
+    #[inline(always)]
+    fn lowest(&self, exit: &Exit) -> f64 {
+        let length = exit.u - self.u;
+        let end = if exit.z < self.z { exit.z } else { self.z };
+        end - 0.25 * self.span.bend * (length * length)
+    }
+
     /// Goes on behind a block of the present level. `false` at the end of the stretch.
     #[inline(always)]
     fn pass(&mut self, exit: Exit) -> bool {
         self.u = exit.u;
         self.z = exit.z;
-        let Some(axis) = exit.axis else {
-            if exit.u >= self.stretch.end_u {
-                return false;
-            }
-            self.span = self.path.next_span(&self.span);
-            self.cell = [0, 1].map(|axis| self.ray.cell_after(axis, exit.u));
-            return true;
-        };
+        if exit.ends {
+            return self.next_span(exit.u);
+        }
+        let (axis, along) = (exit.axis, 1 - exit.axis);
         let before = self.cell[axis];
-        let after = if self.ray.forward[axis] {
-            ((before >> self.level) + 1) << self.level
-        } else {
-            ((before >> self.level) << self.level) - 1
-        };
+        // Behind the exit line: the cell that begins there, or the one that ends there.
+        let after =
+            (((before >> self.level) + self.ahead[axis]) << self.level) - 1 + self.ahead[axis];
         if after < 0 || after >= self.ray.cells[axis] {
             return false;
         }
-        let along = 1 - axis;
-        let across =
-            if self.level == 0 { self.cell[along] } else { self.ray.cell_after(along, exit.u) };
+        if self.level > 0 {
+            self.cell[along] = self.ray.cell_after(along, exit.u);
+        }
         self.cell[axis] = after;
-        self.cell[along] = across;
         if (before ^ after) >> (self.level + 1) != 0 && self.level < self.maxima.top() {
             self.level += 1;
         }
         true
     }
 
+    /// Goes on with the next span. `false` at the end of the stretch.
+    #[cold]
+    fn next_span(&mut self, u: f64) -> bool {
+        if u >= self.stretch.end_u {
+            return false;
+        }
+        self.span = self.path.next_span(&self.span);
+        self.limit = self.stretch.end_u.min(self.span.end_u);
+        self.cell = [self.ray.cell_after(0, u), self.ray.cell_after(1, u)];
+        true
+    }
+
     /// Where the ray meets the cell that it is in, within the present span and stretch.
-    #[inline]
-    fn contact(&self, corners: &crate::cell::Corners) -> Option<Contact> {
-        let (ray, cell) = (self.ray, self.cell);
-        let [in_x, in_y] = [0, 1].map(|axis| ray.line_u(axis, ray.entry_line(axis, cell[axis])));
-        let [out_x, out_y] = [0, 1].map(|axis| ray.line_u(axis, ray.exit_line(axis, cell[axis])));
+    #[inline(always)]
+    fn contact(&self, tile: &HeightTile) -> Option<Contact> {
+        let (ray, cell) = (&self.ray, self.cell);
+        let corners = corners_in(tile, cell)?;
+        let in_u = |axis| ray.line_u(axis, ray.entry_line(axis, cell[axis]));
+        let out_u = |axis| ray.line_u(axis, ray.exit_line(axis, cell[axis]));
+        let ([in_x, in_y], [out_x, out_y]) = ([in_u(0), in_u(1)], [out_u(0), out_u(1)]);
         let first = self.stretch.start_u.max(self.span.start_u);
-        let last = self.stretch.end_u.min(self.span.end_u);
+        let last = self.limit;
         let (in_axis, in_u) = if in_x > in_y { (0, in_x) } else { (1, in_y) };
         let (out_axis, out_u) = if out_x <= out_y { (0, out_x) } else { (1, out_y) };
         let (start_u, end_u) = (in_u.max(first), out_u.min(last));
@@ -303,7 +325,7 @@ impl<'w> Walk<'w> {
             u,
             z: self.span.z(u),
             place: place_in_cell(ray, cell, u),
-            corners: *corners,
+            corners,
         })
     }
 }

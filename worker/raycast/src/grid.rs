@@ -106,10 +106,11 @@ impl GridRay {
     }
 
     /// The cell of an axis in which the ray is just after `u`, agreeing with `line_u`.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn cell_after(&self, axis: usize, u: f64) -> i32 {
         let last = self.cells[axis] - 1;
-        let index = (self.position(axis, u).floor() as i32).clamp(0, last);
+        // Cut off, not rounded down: the same once what is below 0 is raised to it.
+        let index = (self.position(axis, u) as i32).clamp(0, last);
         let step = if self.forward[axis] { 1 } else { -1 };
         if self.line_u(axis, self.exit_line(axis, index)) <= u {
             (index + step).clamp(0, last)

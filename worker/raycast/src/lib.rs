@@ -23,6 +23,7 @@
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
 //! multiplication is used in anything that ends in a pixel.
 
+mod beam;
 mod cell;
 mod exact;
 mod field;
@@ -38,7 +39,7 @@ mod srgb;
 #[cfg(test)]
 mod tests_support;
 
-pub use progress::{Hit, Missing, Progress, Rendered, Stats, cast};
+pub use progress::{Hit, Missing, Progress, Rendered, Stats, cast, trace};
 pub use pyramid::Pyramid;
 
 use terrafarm_common::camera::Camera;

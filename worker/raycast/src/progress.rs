@@ -1,6 +1,7 @@
 //! From a region to rays, and from colours to pixels; what is done and what is not.
 
 use crate::View;
+use crate::beam::{Beams, WIDEST_PX};
 use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
 use crate::path::{Ground, Path};
@@ -17,9 +18,8 @@ use terrafarm_common::shading::LinearRgb;
 use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::Resident;
 
-/// Side of the squares of pixels that are worked on together. Squares start at multiples
-/// of it in the frame.
-const BLOCK_PX: u32 = 16;
+/// Share by which a depth is shortened where it becomes a parameter, against rounding.
+const ROUNDING: f64 = 1e-9;
 
 /// A region with its pixels.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -82,9 +82,11 @@ impl Progress {
         }
         let mut missing = BTreeSet::new();
         let mut painter = Painter::new(field, view);
-        for block in blocks(self.region) {
-            self.paint(&mut painter, block);
+        let mut beams = Beams::new(field, &view.camera, painter.ground);
+        for square in squares(self.region) {
+            beams.narrow(square, &mut |x, y, free| self.paint(&mut painter, x, y, free));
         }
+        self.stats.steps += beams.steps;
         painter.finish(&mut self.stats, &mut missing);
         missing.into_iter().collect()
     }
@@ -99,20 +101,16 @@ impl Progress {
         Rendered { pixels: self.pixels, missing, stats: self.stats }
     }
 
-    fn paint(&mut self, painter: &mut Painter, block: Region) {
-        for y in block.y..block.y + block.height {
-            for x in block.x..block.x + block.width {
-                let (column, row) = (x - self.region.x, y - self.region.y);
-                let at = row as usize * self.region.width as usize + column as usize;
-                if self.done[at] {
-                    continue;
-                }
-                if let Some(color) = painter.pixel(x, y) {
-                    self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
-                    self.done[at] = true;
-                    self.left -= 1;
-                }
-            }
+    fn paint(&mut self, painter: &mut Painter, x: u32, y: u32, free: f64) {
+        let (column, row) = (x - self.region.x, y - self.region.y);
+        let at = row as usize * self.region.width as usize + column as usize;
+        if self.done[at] {
+            return;
+        }
+        if let Some(color) = painter.pixel(x, y, free) {
+            self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
+            self.done[at] = true;
+            self.left -= 1;
         }
     }
 
@@ -126,12 +124,12 @@ impl Progress {
 }
 
 /// The parts of a region in squares of the frame.
-fn blocks(region: Region) -> impl Iterator<Item = Region> {
+fn squares(region: Region) -> impl Iterator<Item = Region> {
     let cuts = |start: u32, length: u32| {
         let end = start.saturating_add(length);
-        (start / BLOCK_PX..end.div_ceil(BLOCK_PX)).map(move |block| {
-            let low = (block * BLOCK_PX).max(start);
-            (low, ((block + 1) * BLOCK_PX).min(end) - low)
+        (start / WIDEST_PX..end.div_ceil(WIDEST_PX)).map(move |block| {
+            let low = (block * WIDEST_PX).max(start);
+            (low, ((block + 1) * WIDEST_PX).min(end) - low)
         })
     };
     cuts(region.y, region.height).flat_map(move |(y, height)| {
@@ -164,9 +162,10 @@ impl<'a> Caster<'a> {
         }
     }
 
-    fn cast(&mut self, path: &Path) -> Outcome {
+    /// Finds where a ray meets the surface. It is known not to before `free_u`.
+    fn cast(&mut self, path: &Path, free_u: f64) -> Outcome {
         match self {
-            Caster::Exact(caster) => caster.cast(path, 0.0),
+            Caster::Exact(caster) => caster.cast(path, free_u),
             Caster::Reference(caster) => caster.cast(path),
         }
     }
@@ -198,13 +197,13 @@ impl<'a> Painter<'a> {
 
     /// The mean of the samples of a pixel; `None` if a tile is missing. All samples are
     /// tried in any case, so that all missing tiles become known.
-    fn pixel(&mut self, x: u32, y: u32) -> Option<LinearRgb> {
+    fn pixel(&mut self, x: u32, y: u32, free: f64) -> Option<LinearRgb> {
         let mut sum = [0.0f32; 3];
         let mut complete = true;
         for row in 0..self.samples {
             for column in 0..self.samples {
                 let place = self.place(x, y, column, row);
-                match self.sample(place) {
+                match self.sample(place, free) {
                     Some(color) => (0..3).for_each(|c| sum[c] += color[c].min(1.0)),
                     None => complete = false,
                 }
@@ -214,10 +213,10 @@ impl<'a> Painter<'a> {
         complete.then(|| sum.map(|channel| channel * share))
     }
 
-    fn sample(&mut self, place: [f64; 2]) -> Option<LinearRgb> {
+    fn sample(&mut self, place: [f64; 2], free: f64) -> Option<LinearRgb> {
         self.rays += 1;
-        let path = path(&self.view.camera, self.ground, place);
-        match self.caster.cast(&path) {
+        let (path, free_u) = path(&self.view.camera, self.ground, place, free);
+        match self.caster.cast(&path, free_u) {
             Outcome::Hit(contact) => {
                 self.hits += 1;
                 let distance = path.distance(contact.u, contact.z);
@@ -261,8 +260,11 @@ fn scatter(x: u32, y: u32, sample: u32) -> [f64; 2] {
     [unit(bits as u32), unit((bits >> 32) as u32)]
 }
 
-fn path(camera: &Camera, ground: Ground, place: [f64; 2]) -> Path {
-    Path::new(ground, camera.position, camera.ray(place[0], place[1]).normalize())
+/// The ray through a point of the picture, and its parameter at a depth.
+fn path(camera: &Camera, ground: Ground, place: [f64; 2], depth: f64) -> (Path, f64) {
+    let ray = camera.ray(place[0], place[1]);
+    let length = ray.length();
+    (Path::new(ground, camera.position, ray / length), depth * (length * (1.0 - ROUNDING)))
 }
 
 /// What a point of the picture shows.
@@ -302,9 +304,9 @@ pub fn cast(
 ) -> Result<Option<Hit>, Missing> {
     let field = Field { resident, pyramid };
     let ground = Ground::new(view.shading.earth);
-    let path = path(&view.camera, ground, [x_px, y_px]);
+    let (path, _) = path(&view.camera, ground, [x_px, y_px], 0.0);
     let mut caster = Caster::new(field, view.quality.method);
-    match caster.cast(&path) {
+    match caster.cast(&path, 0.0) {
         Outcome::Hit(contact) => Ok(Some(Hit::new(&path, &contact))),
         Outcome::Miss => Ok(None),
         Outcome::Unfinished => {
@@ -313,6 +315,44 @@ pub fn cast(
             Err(Missing(missing.into_iter().collect()))
         }
     }
+}
+
+/// What is seen through the centres of the pixels of a region: `see` is told of each
+/// pixel, by column and row, whether and where its ray meets the ground. The counters
+/// are those of a rendered picture with one sample a pixel.
+///
+/// # Errors
+/// If tiles are missing; `see` is not told of the pixels that need them.
+pub fn trace(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+    mut see: impl FnMut(u32, u32, Option<Hit>),
+) -> Result<Stats, Missing> {
+    let mut stats = Stats::default();
+    let mut missing = BTreeSet::new();
+    let field = Field { resident, pyramid };
+    let ground = Ground::new(view.shading.earth);
+    let mut caster = Caster::new(field, view.quality.method);
+    let mut beams = Beams::new(field, &view.camera, ground);
+    for square in squares(region) {
+        beams.narrow(square, &mut |x, y, free| {
+            let place = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+            let (path, free_u) = path(&view.camera, ground, place, free);
+            stats.rays += 1;
+            match caster.cast(&path, free_u) {
+                Outcome::Hit(contact) => {
+                    stats.hits += 1;
+                    see(x, y, Some(Hit::new(&path, &contact)));
+                }
+                Outcome::Miss => see(x, y, None),
+                Outcome::Unfinished => {}
+            }
+        });
+    }
+    stats.steps = beams.steps + caster.finish(&mut missing);
+    if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
 }
 
 impl Hit {

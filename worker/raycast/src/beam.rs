@@ -1,0 +1,265 @@
+//! Beams: how far all rays through a square of pixels are free, found once for all.
+//!
+//! ```text
+//! square <- 32 x 32 pixels; free <- 0
+//! loop
+//!   ground <- the rectangle of the map below the beam from `free` to `free + step`
+//!   if the beam's lowest ray stays above the maximum of the ground
+//!     free <- free + step; double the step
+//!   else if the step is longer than the beam is wide
+//!     halve the step
+//!   else
+//!     stop: quarter the square and go on with each part, or cast its rays from `free`
+//! ```
+//!
+//! Beams leave out ground, they never decide on a contact: the bounds below are loose on
+//! the safe side by [`CLEARANCE_M`], so no ray meets a cell before the beam's `free`, and
+//! a caster that begins there finds what it would have found from the camera on.
+//!
+//! All lengths along a beam are *depths*: multiples t of [`Camera::ray`], which is linear
+//! in the pixel. So the bounds of the directions in a square are those at its corners.
+//! Height grows both with the square of the map distance and with the straight rise (see
+//! `path`), so it is bounded from below over an interval of depths by the least of both.
+
+use crate::field::{Field, Ground, tile_key};
+use crate::grid::cells_of;
+use crate::path;
+use glam::DVec3;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::region::Region;
+use terrafarm_terrain::layout::{LayerKind, TILE_CELLS};
+use terrafarm_terrain::tile::MAXIMA_LEVELS;
+
+/// Side of the squares that beams begin with, pixels.
+pub(crate) const WIDEST_PX: u32 = 32;
+/// Side of the squares whose rays are cast one by one, pixels.
+const NARROWEST_PX: u32 = 4;
+/// How far above the ground a beam must stay, metres. The parabolas of a path are within
+/// 1e-4 m of the curve that beams follow, rounding is far less.
+const CLEARANCE_M: f64 = 1e-2;
+/// Share by which lengths and cells are widened against rounding.
+const ROUNDING: f64 = 1e-9;
+/// The first step of a beam, as a share of the side of the largest layer.
+const FIRST_STEP: f64 = 0.125;
+/// The shortest step, in widths of the beam.
+const SHORTEST_STEP: f64 = 1.0;
+/// The longest way of a beam over flat ground, metres.
+const FLAT_REACH_M: f64 = 1e8;
+/// The same over the Earth, radians: within what `path` is made for.
+const REACH_RAD: f64 = 0.19;
+
+/// The beams of one view.
+pub(crate) struct Beams<'a> {
+    field: Field<'a>,
+    camera: &'a Camera,
+    ground: path::Ground,
+    layers: Vec<Grid>,
+    first_step: f64,
+    /// Intervals of depth looked at.
+    pub steps: u64,
+}
+
+/// A height layer.
+struct Grid {
+    number: usize,
+    /// Position of the camera, in cells from post (0, 0).
+    eye: [f64; 2],
+    /// Cells per metre.
+    scale: [f64; 2],
+    cells: [i32; 2],
+}
+
+/// A beam that is free up to a depth.
+#[derive(Clone, Copy)]
+struct Front {
+    free: f64,
+    step: f64,
+}
+
+/// Bounds of the directions in a square.
+struct Bounds {
+    low: DVec3,
+    high: DVec3,
+    /// Least squared length of their parts along the map.
+    across_squared: f64,
+    /// The depth to which the bounds hold.
+    reach: f64,
+    /// Width of the beam at depth 1.
+    width: f64,
+}
+
+impl<'a> Beams<'a> {
+    pub(crate) fn new(field: Field<'a>, camera: &'a Camera, ground: path::Ground) -> Self {
+        let eye = camera.position;
+        let mut first_step = 0.0f64;
+        let layers = field.index().layers_of(LayerKind::Height).map(|(number, layer)| {
+            let scale = layer.spacing.map(|spacing| 1.0 / spacing);
+            let cells = cells_of(layer);
+            for axis in 0..2 {
+                let side = f64::from(cells[axis]) * layer.spacing[axis];
+                first_step = first_step.max(side * FIRST_STEP);
+            }
+            let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
+            Grid { number, eye, scale, cells }
+        });
+        let layers = layers.collect();
+        Beams { field, camera, ground, layers, first_step, steps: 0 }
+    }
+
+    /// Calls `see` for each pixel of a square with the depth up to which every ray
+    /// through the pixel is free.
+    pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(u32, u32, f64)) {
+        self.quarter(square, WIDEST_PX, Front { free: 0.0, step: self.first_step }, see);
+    }
+
+    fn quarter(
+        &mut self,
+        square: Region,
+        side: u32,
+        front: Front,
+        see: &mut impl FnMut(u32, u32, f64),
+    ) {
+        let front = self.advance(&self.bounds(square), front);
+        let Region { x, y, width, height } = square;
+        if side <= NARROWEST_PX {
+            for row in y..y + height {
+                for column in x..x + width {
+                    see(column, row, front.free);
+                }
+            }
+            return;
+        }
+        let half = side / 2;
+        let halves = |length: u32| [(0, length.min(half)), (half, length.saturating_sub(half))];
+        for (top, height) in halves(height).into_iter().filter(|part| part.1 > 0) {
+            for (left, width) in halves(width).into_iter().filter(|part| part.1 > 0) {
+                let part = Region { x: x + left, y: y + top, width, height };
+                self.quarter(part, half, front, see);
+            }
+        }
+    }
+
+    /// Bounds of the rays through all points of a square of pixels.
+    fn bounds(&self, square: Region) -> Bounds {
+        let camera = self.camera;
+        let left_top = [f64::from(square.x), f64::from(square.y)];
+        let right_bottom =
+            [left_top[0] + f64::from(square.width), left_top[1] + f64::from(square.height)];
+        let corners = [
+            camera.ray(left_top[0], left_top[1]),
+            camera.ray(right_bottom[0], left_top[1]),
+            camera.ray(left_top[0], right_bottom[1]),
+            camera.ray(right_bottom[0], right_bottom[1]),
+        ];
+        let (mut low, mut high) = (corners[0], corners[0]);
+        let mut longest = 0.0f64;
+        for corner in corners {
+            (low, high) = (low.min(corner), high.max(corner));
+            longest = longest.max(corner.length_squared());
+        }
+        let margin = DVec3::splat(longest * ROUNDING);
+        (low, high) = (low - margin, high + margin);
+        let nearest = |axis: usize| low[axis].max(-high[axis]).max(0.0);
+        let curvature = self.ground.curvature();
+        let longest = longest.sqrt();
+        Bounds {
+            low,
+            high,
+            across_squared: nearest(0) * nearest(0) + nearest(1) * nearest(1),
+            reach: if curvature > 0.0 {
+                REACH_RAD / (curvature * longest)
+            } else {
+                FLAT_REACH_M / longest
+            },
+            width: f64::from(square.width.max(square.height)) / camera.focal_px(),
+        }
+    }
+
+    fn advance(&mut self, bounds: &Bounds, mut front: Front) -> Front {
+        let eye_z = self.camera.position.z;
+        loop {
+            let Front { free, step } = front;
+            if free >= bounds.reach {
+                return front;
+            }
+            self.steps += 1;
+            let end = (free + step).min(bounds.reach);
+            let rise = (bounds.low.z * free).min(bounds.low.z * end);
+            let z = eye_z + self.ground.rise(eye_z, bounds.across_squared * free * free, rise);
+            let lowest = z - CLEARANCE_M;
+            if bounds.low.z >= 0.0 && lowest > self.field.pyramid.highest() {
+                return Front { free: f64::INFINITY, step };
+            }
+            if self.is_clear(bounds, free, end, lowest) {
+                front = Front { free: end, step: 2.0 * step };
+            } else if step > bounds.width * end * SHORTEST_STEP + self.finest_step() {
+                front.step = 0.5 * step;
+            } else {
+                return front;
+            }
+        }
+    }
+
+    fn finest_step(&self) -> f64 {
+        self.layers.iter().map(|grid| 1.0 / grid.scale[0]).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Whether all ground below a beam from depth `start` to `end` is lower than `lowest`.
+    fn is_clear(&self, bounds: &Bounds, start: f64, end: f64, lowest: f64) -> bool {
+        self.layers.iter().all(|grid| {
+            let mut first = [0; 2];
+            let mut last = [0; 2];
+            for axis in 0..2 {
+                let (slow, fast) = (bounds.low[axis], bounds.high[axis]);
+                let low = grid.eye[axis] + grid.scale[axis] * (slow * start).min(slow * end);
+                let high = grid.eye[axis] + grid.scale[axis] * (fast * start).max(fast * end);
+                let count = f64::from(grid.cells[axis]);
+                let margin = ROUNDING * (1.0 + count + low.abs().max(high.abs()));
+                if high + margin < 0.0 || low - margin > count {
+                    return true;
+                }
+                first[axis] = ((low - margin) as i32).max(0);
+                last[axis] = ((high + margin) as i32).min(grid.cells[axis] - 1);
+            }
+            self.is_below(grid, first, last, lowest)
+        })
+    }
+
+    /// Whether the cells from `first` to `last` are lower than `lowest`: by at most four
+    /// blocks that cover them.
+    fn is_below(&self, grid: &Grid, first: [i32; 2], last: [i32; 2], lowest: f64) -> bool {
+        if grid.cells.contains(&0) {
+            return true;
+        }
+        let maxima = self.field.pyramid.layer(grid.number);
+        let side = (last[0] - first[0]).max(last[1] - first[1]).max(1) as u32;
+        let level = (side.ilog2() as usize + usize::from(!side.is_power_of_two())).max(1);
+        let level = level.min(maxima.top());
+        let [west, south] = first.map(|cell| cell >> level);
+        let [east, north] = last.map(|cell| cell >> level);
+        for bj in south..=north {
+            for bi in west..=east {
+                let max = if level >= MAXIMA_LEVELS {
+                    maxima.block_max(level, bi as usize, bj as usize)
+                } else {
+                    let cell = [bi << level, bj << level];
+                    let tile = |index: i32| index as usize >> MAXIMA_LEVELS;
+                    match self.field.ground(tile_key(grid.number, cell)) {
+                        Ground::Loaded(loaded) => {
+                            let within = |index: i32| (index as usize & (TILE_CELLS - 1)) >> level;
+                            loaded.block_max(level, within(cell[0]), within(cell[1]))
+                        }
+                        Ground::Void => f32::NEG_INFINITY,
+                        Ground::Absent => {
+                            maxima.block_max(MAXIMA_LEVELS, tile(cell[0]), tile(cell[1]))
+                        }
+                    }
+                };
+                if f64::from(max) >= lowest {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+}
