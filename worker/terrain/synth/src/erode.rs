@@ -21,7 +21,12 @@ const STEPS_COARSEST: f32 = 60.0;
 const STEP_SHARE: f32 = 0.62;
 /// Uplift over erodibility, metres: the slope of a valley that drains 1 m²; a valley that
 /// drains 1 km² has a thousandth of it.
-const STEEPNESS_M: f32 = 170.0;
+const STEEPNESS_M: f32 = 300.0;
+/// Where less than this drains, soil creeps and no river cuts, km². It sets how far apart
+/// valleys are.
+const HILLSLOPE_KM2: f32 = 0.7;
+/// How far soil creeps between two steps, metres.
+const CREEP_M: f32 = 220.0;
 /// Time step; erodibility is 1.
 const STEP: f32 = 1.0;
 
@@ -77,7 +82,7 @@ impl Tectonics {
         let scale = f64::from(self.extent_m / 3_000.0);
         let noise = Noise::new(self.seed, 3);
         let hard = noise.fbm(f64::from(x) * scale, f64::from(y) * scale, 4);
-        (0.78 + 0.34 * hard).clamp(0.45, 1.35)
+        (0.52 + 0.32 * hard).clamp(0.26, 1.05)
     }
 
     fn outlet_cells(&self, side: usize) -> Vec<(u32, f32)> {
@@ -152,21 +157,25 @@ fn erode(
     let repose = Grid::from_fn(side, |x, y| tectonics.repose(place(x), place(y)) * cell_m);
     let outlets = tectonics.outlet_cells(side);
     let outlet_cells = tectonics.outlets(side);
+    let hillslope = HILLSLOPE_KM2 * 1e6 / (cell_m * cell_m);
+    let creeps = ((CREEP_M / cell_m) as usize).clamp(1, 8);
     for &(cell, height) in &outlets {
         heights.values_mut()[cell as usize] = height;
     }
     for _ in 0..steps {
         watch.check()?;
         let flow = Flow::new(heights, &outlet_cells, tectonics.sway());
-        incise(heights, &flow, &uplift, &repose);
-        creep(heights, &flow, &outlet_cells);
+        incise(heights, &flow, &uplift, &repose, hillslope);
+        for _ in 0..creeps {
+            creep(heights, &flow, &outlet_cells, hillslope);
+        }
         watch.advance(share / steps as f32);
     }
     Ok(())
 }
 
 /// One implicit step of uplift, incision and sliding.
-fn incise(heights: &mut Grid, flow: &Flow, uplift: &Grid, repose: &Grid) {
+fn incise(heights: &mut Grid, flow: &Flow, uplift: &Grid, repose: &Grid, hillslope: f32) {
     let values = heights.values_mut();
     for &cell in &flow.order {
         let cell = cell as usize;
@@ -177,14 +186,16 @@ fn incise(heights: &mut Grid, flow: &Flow, uplift: &Grid, repose: &Grid) {
         let base = values[receiver];
         let raised = values[cell] + STEP * STEEPNESS_M * uplift.values()[cell];
         // In cells: sqrt(area) * cell / (distance * cell).
-        let pull = STEP * flow.area[cell].sqrt() / flow.distance[cell];
+        let area = flow.area[cell];
+        let channel = area / (area + hillslope);
+        let pull = STEP * channel * area.sqrt() / flow.distance[cell];
         let cut = if raised > base { (raised + pull * base) / (1.0 + pull) } else { raised };
         values[cell] = cut.min(base + repose.values()[cell] * flow.distance[cell]);
     }
 }
 
 /// Soil creep rounds what is not a channel.
-fn creep(heights: &mut Grid, flow: &Flow, outlets: &[u32]) {
+fn creep(heights: &mut Grid, flow: &Flow, outlets: &[u32], hillslope: f32) {
     let before = heights.clone();
     let side = before.side();
     heights.values_mut().par_chunks_mut(side).enumerate().for_each(|(y, row)| {
@@ -195,7 +206,7 @@ fn creep(heights: &mut Grid, flow: &Flow, outlets: &[u32]) {
                     + before.at(cx + 1, cy)
                     + before.at(cx, cy - 1)
                     + before.at(cx, cy + 1));
-            let share = 0.30 / (1.0 + 0.15 * flow.area[y * side + x]);
+            let share = 0.5 / (1.0 + 4.0 * flow.area[y * side + x] / hillslope);
             *value += share * (mean - *value);
         }
     });

@@ -21,8 +21,6 @@ pub(crate) struct Landscape {
     pub heights: Grid,
     /// Level of the lake over or beside each cell, metres; minus infinity elsewhere.
     pub level: Grid,
-    /// Logarithm to base 2 of the number of cells that drain through.
-    pub wetness: Grid,
     /// Share of the cell that is gravel floor or fan, 0..1.
     pub floor: Grid,
     /// Height above the mean of the surroundings, metres.
@@ -58,7 +56,6 @@ impl Landscape {
         let rivers = Rivers::new(&flow, &heights, cell_m);
         watch.check()?;
 
-        let wetness = Grid::from_fn(side, |x, y| libm::log2f(flow.area[y * side + x])).smoothed();
         let mut mean = heights.clone();
         for _ in 0..6 {
             mean = mean.smoothed();
@@ -67,7 +64,7 @@ impl Landscape {
             heights.at(x as i64, y as i64) - mean.at(x as i64, y as i64)
         });
         let level = reach_of_lakes(&level, &heights);
-        Ok(Landscape { cell_m, heights, level, wetness, floor, openness, rivers, relief })
+        Ok(Landscape { cell_m, heights, level, floor, openness, rivers, relief })
     }
 }
 

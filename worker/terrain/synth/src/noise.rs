@@ -89,24 +89,6 @@ impl Noise {
         sum / norm * 1.3
     }
 
-    /// Octaves folded into crests: 0 in the hollows, 1 on the crests.
-    #[inline]
-    pub fn ridged(&self, x: f64, y: f64, octaves: u32) -> f32 {
-        let (mut sum, mut strength, mut scale, mut norm) = (0.0, 1.0, 1.0, 0.0);
-        let mut weight = 1.0;
-        for octave in 0..octaves {
-            let shift = f64::from(octave) * 31.7;
-            let crest = (1.0 - self.at(x * scale + shift, y * scale - shift).abs()).max(0.0);
-            let crest = crest * crest * weight;
-            weight = (crest * 1.6).clamp(0.0, 1.0);
-            sum += strength * crest;
-            norm += strength;
-            strength *= 0.5;
-            scale *= 2.07;
-        }
-        sum / norm
-    }
-
     /// Waves whose crests run along the direction of (`down_x`, `down_y`), a unit vector:
     /// ribs and gullies down a slope. Returns the height of the wave, −1 to 1, and its
     /// slope across that direction in heights per wavelength.

@@ -12,7 +12,7 @@ type Color = [f32; 3];
 /// Height of the tree line and of the snow line above the lowest valley, metres, for the
 /// full relief.
 const TREE_LINE_M: f32 = 1230.0;
-const SNOW_LINE_M: f32 = 1720.0;
+const SNOW_LINE_M: f32 = 1780.0;
 const BASE_M: f32 = 480.0;
 
 /// What decides the colour of a pixel.
@@ -25,10 +25,9 @@ struct Site {
     v: f64,
     height: f32,
     depth: f32,
-    /// Slope, metres per metre, and its parts.
+    /// Slope, metres per metre, and its part towards the north.
     slope: f32,
     slope_y: f32,
-    slope_x: f32,
     /// Height above the mean of the neighbouring posts, metres per metre.
     bulge: f32,
 }
@@ -116,7 +115,6 @@ fn site_between(
         height: of(|ground| ground.height),
         depth: of(|ground| ground.depth),
         slope: (slope_x * slope_x + slope_y * slope_y).sqrt(),
-        slope_x,
         slope_y,
         bulge,
     }
@@ -153,7 +151,6 @@ struct Cast {
     /// Height above the lowest valley, metres, stretched to the full relief.
     rise: f32,
     floor: f32,
-    wetness: f32,
     openness: f32,
 }
 
@@ -182,7 +179,6 @@ impl<'a> Palette<'a> {
             grain,
             rise: (site.height - BASE_M) / land.relief.max(0.05),
             floor: land.floor.bilinear(site.u, site.v),
-            wetness: land.wetness.bilinear(site.u, site.v),
             openness: land.openness.bilinear(site.u, site.v),
         };
         let mut color = self.grass(site, &cast);
@@ -250,7 +246,7 @@ impl<'a> Palette<'a> {
         let sunny = (site.slope_y * 0.9).clamp(-0.5, 0.5);
         let line = TREE_LINE_M + 150.0 * cast.wide + 170.0 * cast.middle + 130.0 * sunny;
         let below = smoothstep(70.0, -50.0, cast.rise - line + 60.0 * cast.fine);
-        let standing = smoothstep(1.15, 0.85, site.slope + 0.1 * cast.fine);
+        let standing = smoothstep(1.0, 0.72, site.slope + 0.1 * cast.fine);
         // Snow slides keep the gullies free of trees, the more so near the tree line.
         let slides = smoothstep(-0.01, -0.05, site.bulge)
             * smoothstep(0.40, 0.62, site.slope)
@@ -283,7 +279,7 @@ impl<'a> Palette<'a> {
         let scree_share = (loose.max(0.8 * barren)) * (0.75 + 0.5 * cast.fine).clamp(0.0, 1.0);
         let scree = blend([136.0, 130.0, 120.0], [164.0, 158.0, 148.0], 0.5 + 0.9 * cast.fine);
         cover(color, scree.map(|c| c * (1.0 + 0.10 * cast.grain)), scree_share);
-        let limit = mix(1.02, 0.70, high);
+        let limit = mix(0.88, 0.52, high);
         let ribs = smoothstep(0.0, 0.10, site.bulge) * 0.18;
         let share = smoothstep(limit - 0.10, limit + 0.14, steep + ribs);
         if share <= 0.0 {
@@ -308,7 +304,7 @@ impl<'a> Palette<'a> {
             + 190.0 * sunny
             + 900.0 * site.bulge.clamp(-0.18, 0.18);
         let above = smoothstep(-70.0, 110.0, cast.rise - line + 70.0 * cast.fine);
-        let hold = mix(0.80, 1.25, smoothstep(0.0, 500.0, cast.rise - line));
+        let hold = mix(0.58, 0.92, smoothstep(0.0, 600.0, cast.rise - line));
         let lies = smoothstep(hold + 0.12, hold - 0.16, site.slope + 0.13 * cast.fine);
         let share = above * lies;
         if share <= 0.0 {

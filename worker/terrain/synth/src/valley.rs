@@ -26,7 +26,7 @@ pub(crate) fn deposit(heights: &Grid, flow: &Flow, cell_m: f32, relief: f32) -> 
         let receiver = flow.receiver[cell] as usize;
         let area_km2 = flow.area[cell] * cell_km2;
         let thickness =
-            relief * (11.0 * area_km2.sqrt()).min(95.0) * smoothstep(0.8, 6.0, area_km2);
+            relief * (13.0 * area_km2.sqrt()).min(125.0) * smoothstep(0.8, 6.0, area_km2);
         let slope = (0.05 / (0.15 + area_km2).sqrt()).clamp(0.004, 0.11);
         let graded = values[receiver] + slope * flow.distance[cell] * cell_m;
         values[cell] = (values[cell] + thickness).max(graded);
