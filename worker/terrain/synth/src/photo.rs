@@ -12,7 +12,7 @@ type Color = [f32; 3];
 /// Height of the tree line and of the snow line above the lowest valley, metres, for the
 /// full relief.
 const TREE_LINE_M: f32 = 1230.0;
-const SNOW_LINE_M: f32 = 1780.0;
+const SNOW_LINE_M: f32 = 1640.0;
 const BASE_M: f32 = 480.0;
 
 /// What decides the colour of a pixel.
@@ -279,7 +279,7 @@ impl<'a> Palette<'a> {
         let scree_share = (loose.max(0.8 * barren)) * (0.75 + 0.5 * cast.fine).clamp(0.0, 1.0);
         let scree = blend([136.0, 130.0, 120.0], [164.0, 158.0, 148.0], 0.5 + 0.9 * cast.fine);
         cover(color, scree.map(|c| c * (1.0 + 0.10 * cast.grain)), scree_share);
-        let limit = mix(0.88, 0.52, high);
+        let limit = mix(1.0, 0.54, high);
         let ribs = smoothstep(0.0, 0.10, site.bulge) * 0.18;
         let share = smoothstep(limit - 0.10, limit + 0.14, steep + ribs);
         if share <= 0.0 {
@@ -288,7 +288,7 @@ impl<'a> Palette<'a> {
         // Beds of rock dip across the map and show as bands on steep ground.
         let bed = site.height * 0.013 + cast.wide * 1.3 + (site.x - 0.6 * site.y) as f32 * 0.0011;
         let band = self.fine.at(f64::from(bed) * 2.3, 0.5 + f64::from(cast.middle) * 0.2);
-        let tone = 0.5 + 0.45 * band + 0.35 * cast.fine;
+        let tone = 0.5 + 0.22 * band + 0.40 * cast.fine + 0.25 * cast.middle;
         let gray = blend([84.0, 80.0, 78.0], [138.0, 132.0, 124.0], tone.clamp(0.0, 1.0));
         let warm = blend([96.0, 82.0, 70.0], [150.0, 132.0, 112.0], tone.clamp(0.0, 1.0));
         let rock = blend(gray, warm, smoothstep(-0.1, 0.5, cast.wide));
