@@ -30,8 +30,9 @@ use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
 /// How far above a block's maximum a ray must stay for the block to be skipped, metres.
 /// Rounding in heights and positions is below 1e-8 m; a skip lost to it costs nothing.
 const CLEARANCE_M: f64 = 1e-6;
-/// Level at which a walk begins. Measured on rough terrain; 3 and 5 are as good.
-const FIRST_LEVEL: usize = 4;
+/// Level at which a walk begins. Measured with `examples/bench.rs`: beams come
+/// close to the ground, and 4 takes a quarter longer over a steep view.
+const FIRST_LEVEL: usize = 2;
 
 /// Casts rays, one after another, and remembers the tile that the last one touched.
 pub(crate) struct Exact<'a> {
@@ -44,18 +45,23 @@ pub(crate) struct Exact<'a> {
     pub steps: u64,
 }
 
-/// A walk over one stretch.
-struct Walk<'w> {
-    path: &'w Path,
-    ray: GridRay,
-    maxima: &'w LayerMaxima,
+/// A ray within one span and one stretch: what stays the same from step to step.
+struct Course<'c> {
+    ray: &'c GridRay,
     layer: usize,
+    top: usize,
     /// 1 along an axis on which the index of the cell grows, else 0.
     ahead: [i32; 2],
-    stretch: Stretch,
     span: Span,
-    /// Where the span or the stretch ends, whichever is first.
-    limit: f64,
+    /// Where the span or the stretch begins, whichever is last ...
+    first: f64,
+    /// ... and where one of them ends.
+    last: f64,
+}
+
+/// How far a walk has come.
+#[derive(Clone, Copy)]
+struct Front {
     cell: [i32; 2],
     /// How far the ray is known to be free ...
     u: f64,
@@ -67,13 +73,24 @@ struct Walk<'w> {
 /// The end of the way through a block.
 #[derive(Clone, Copy)]
 struct Exit {
-    /// Where the ray leaves the block, or the span or the stretch ends.
+    /// Where the ray leaves the block, or the course ends.
     u: f64,
     z: f64,
     /// The axis whose line is crossed.
     axis: usize,
-    /// The span or the stretch ends before a line is crossed.
+    /// The course ends before a line is crossed.
     ends: bool,
+}
+
+/// Why a walk pauses.
+enum Halt {
+    Contact(Contact),
+    /// It comes to another tile, or has climbed above the tiles.
+    Tile,
+    /// It leaves the layer.
+    Edge,
+    /// The course ends.
+    End,
 }
 
 impl<'a> Exact<'a> {
@@ -91,6 +108,9 @@ impl<'a> Exact<'a> {
     /// Finds where a ray meets the surface. The caller knows that it does not before
     /// `free_u`.
     pub(crate) fn cast(&mut self, path: &Path, free_u: f64) -> Outcome {
+        if free_u == f64::INFINITY {
+            return Outcome::Miss;
+        }
         let mut rays = std::mem::take(&mut self.rays);
         self.field.grid_rays(path, &mut rays);
         let mut finished = true;
@@ -102,7 +122,7 @@ impl<'a> Exact<'a> {
                 continue;
             }
             let (layer, ray) = &rays[stretch.ray];
-            match self.walk(Walk::new(self.field, path, *layer, *ray, stretch, free_u)) {
+            match self.walk(path, *layer, ray, stretch, free_u) {
                 Outcome::Miss => {}
                 Outcome::Unfinished => finished = false,
                 hit => {
@@ -115,62 +135,70 @@ impl<'a> Exact<'a> {
         if finished { outcome } else { Outcome::Unfinished }
     }
 
-    fn walk(&mut self, mut walk: Walk) -> Outcome {
+    fn walk(
+        &mut self,
+        path: &Path,
+        layer: usize,
+        ray: &GridRay,
+        stretch: Stretch,
+        free_u: f64,
+    ) -> Outcome {
+        let maxima = self.field.pyramid.layer(layer);
         let highest = self.field.pyramid.highest();
+        let u = stretch.start_u.max(free_u);
+        let mut course = Course::new(layer, ray, maxima.top(), path.span_at(u), stretch);
+        let mut front = course.front(u, FIRST_LEVEL);
         let mut finished = true;
-        let mut steps = 0;
-        while !walk.span.leaves_above(highest) {
-            steps += 1;
-            let ground = if walk.level < MAXIMA_LEVELS {
-                self.ground(walk.layer, walk.cell)
+        while !course.span.leaves_above(highest) {
+            let halt = if front.level >= MAXIMA_LEVELS {
+                course.cross_tiles(maxima, &mut front, &mut self.steps)
             } else {
-                Ground::Void
-            };
-            let going_on = match ground {
-                Ground::Loaded(tile) if walk.level > 0 => {
-                    let [bi, bj] =
-                        walk.cell.map(|index| (index as usize & (TILE_CELLS - 1)) >> walk.level);
-                    walk.pass_or_descend(tile.block_max(walk.level, bi, bj))
-                }
-                Ground::Loaded(tile) => match walk.contact(tile) {
-                    Some(_) if !finished => break,
-                    Some(contact) => {
-                        self.steps += steps;
-                        return Outcome::Hit(contact);
+                match self.ground(layer, front.cell) {
+                    Ground::Loaded(tile) => course.cross_tile(tile, &mut front, &mut self.steps),
+                    Ground::Void => {
+                        let exit = course.exit(&front, front.level);
+                        course.pass(&mut front, exit)
                     }
-                    None => walk.pass(walk.exit(0)),
-                },
-                Ground::Void if walk.level < MAXIMA_LEVELS => walk.pass(walk.exit(walk.level)),
-                Ground::Void => {
-                    let [bi, bj] = walk.cell.map(|index| index as usize >> walk.level);
-                    walk.pass_or_descend(walk.maxima.block_max(walk.level, bi, bj))
+                    Ground::Absent => {
+                        finished = false;
+                        Some(self.pass_absent(&course, &mut front))
+                    }
                 }
-                Ground::Absent => {
-                    finished = false;
-                    self.pass_absent(&mut walk)
-                }
+                .unwrap_or(Halt::Tile)
             };
-            if !going_on {
-                break;
+            match halt {
+                Halt::Contact(contact) if finished => return Outcome::Hit(contact),
+                Halt::Tile => {}
+                Halt::End if course.last < stretch.end_u => {
+                    course = Course::new(
+                        layer,
+                        ray,
+                        maxima.top(),
+                        path.next_span(&course.span),
+                        stretch,
+                    );
+                    front = course.front(front.u, front.level);
+                }
+                Halt::Contact(_) | Halt::Edge | Halt::End => break,
             }
         }
-        self.steps += steps;
         if finished { Outcome::Miss } else { Outcome::Unfinished }
     }
 
     /// Goes on behind a tile that is not loaded, if the ray may see what lies there.
     #[cold]
-    fn pass_absent(&mut self, walk: &mut Walk) -> bool {
-        let key = tile_key(walk.layer, walk.cell);
+    fn pass_absent(&mut self, course: &Course, front: &mut Front) -> Halt {
+        let key = tile_key(course.layer, front.cell);
+        self.steps += 1;
         self.wanted.add(key);
-        let exit = walk.exit(MAXIMA_LEVELS);
+        let exit = course.exit(front, MAXIMA_LEVELS);
         // Below everything that the tile holds, the ray most likely ends in it.
         let lowest = self.field.index().entry(key).map(|entry| f64::from(entry.min));
         if lowest.is_none_or(|lowest| exit.z < lowest) {
-            return false;
+            return Halt::Edge;
         }
-        walk.level = MAXIMA_LEVELS;
-        walk.pass(exit)
+        front.level = MAXIMA_LEVELS;
+        course.pass(front, exit).unwrap_or(Halt::Tile)
     }
 
     #[inline]
@@ -183,118 +211,129 @@ impl<'a> Exact<'a> {
     }
 }
 
-impl<'w> Walk<'w> {
-    #[inline(always)]
-    fn new(
-        field: Field<'w>,
-        path: &'w Path,
-        layer: usize,
-        ray: GridRay,
-        stretch: Stretch,
-        free_u: f64,
-    ) -> Self {
-        let maxima = field.pyramid.layer(layer);
-        let u = stretch.start_u.max(free_u);
-        let span = path.span_at(u);
-        Walk {
-            path,
+impl<'c> Course<'c> {
+    fn new(layer: usize, ray: &'c GridRay, top: usize, span: Span, stretch: Stretch) -> Self {
+        Course {
             ray,
-            maxima,
             layer,
+            top,
             ahead: [i32::from(ray.forward[0]), i32::from(ray.forward[1])],
-            stretch,
             span,
-            limit: stretch.end_u.min(span.end_u),
-            cell: [ray.cell_after(0, u), ray.cell_after(1, u)],
-            u,
-            z: span.z(u),
-            level: FIRST_LEVEL.min(maxima.top()),
+            first: stretch.start_u.max(span.start_u),
+            last: stretch.end_u.min(span.end_u),
         }
+    }
+
+    /// The beginning of a walk.
+    fn front(&self, u: f64, level: usize) -> Front {
+        let cell = [self.ray.cell_after(0, u), self.ray.cell_after(1, u)];
+        Front { cell, u, z: self.span.z(u), level: level.min(self.top) }
+    }
+
+    /// Walks over one tile.
+    #[inline(always)]
+    fn cross_tile(&self, tile: &HeightTile, place: &mut Front, steps: &mut u64) -> Option<Halt> {
+        // Kept apart from `place`, so that it may live in registers.
+        let mut front = *place;
+        let mut taken = 0;
+        let halt = loop {
+            taken += 1;
+            let exit = self.exit(&front, front.level);
+            if front.level > 0 {
+                let [bi, bj] =
+                    front.cell.map(|index| (index as usize & (TILE_CELLS - 1)) >> front.level);
+                if !self.clears(&front, &exit, tile.block_max(front.level, bi, bj)) {
+                    front.level -= 1;
+                    continue;
+                }
+            } else if let Some(contact) = self.contact(tile, front.cell) {
+                break Some(Halt::Contact(contact));
+            }
+            let before = front.cell;
+            let halt = self.pass(&mut front, exit);
+            let other = (before[0] ^ front.cell[0]) | (before[1] ^ front.cell[1]);
+            if halt.is_some() || other >> MAXIMA_LEVELS != 0 || front.level == MAXIMA_LEVELS {
+                break halt;
+            }
+        };
+        *place = front;
+        *steps += taken;
+        halt
+    }
+
+    /// Walks over whole tiles until one must be looked into.
+    fn cross_tiles(&self, maxima: &LayerMaxima, front: &mut Front, steps: &mut u64) -> Halt {
+        while front.level >= MAXIMA_LEVELS {
+            *steps += 1;
+            let [bi, bj] = front.cell.map(|index| index as usize >> front.level);
+            let exit = self.exit(front, front.level);
+            if !self.clears(front, &exit, maxima.block_max(front.level, bi, bj)) {
+                front.level -= 1;
+            } else if let Some(halt) = self.pass(front, exit) {
+                return halt;
+            }
+        }
+        Halt::Tile
     }
 
     /// Where the ray leaves the block of a level that holds the cell.
     #[inline(always)]
-    fn exit(&self, level: usize) -> Exit {
+    fn exit(&self, front: &Front, level: usize) -> Exit {
         let line_u = |axis: usize| {
-            let line = ((self.cell[axis] >> level) + self.ahead[axis]) << level;
+            let line = ((front.cell[axis] >> level) + self.ahead[axis]) << level;
             self.ray.line_u(axis, line)
         };
         let (x_u, y_u) = (line_u(0), line_u(1));
         let axis = usize::from(y_u < x_u);
         let line_u = if y_u < x_u { y_u } else { x_u };
-        let ends = line_u >= self.limit;
-        let u = if ends { self.limit } else { line_u };
+        let ends = line_u >= self.last;
+        let u = if ends { self.last } else { line_u };
         Exit { u, z: self.span.z(u), axis, ends }
     }
 
-    /// Passes the block if the ray clears its maximum, else looks closer.
+    /// Whether the ray stays above a height until it leaves a block.
     #[inline(always)]
-    fn pass_or_descend(&mut self, max: f32) -> bool {
-        let exit = self.exit(self.level);
-        if self.lowest(&exit) > f64::from(max) + CLEARANCE_M {
-            self.pass(exit)
-        } else {
-            self.level -= 1;
-            true
-        }
+    fn clears(&self, front: &Front, exit: &Exit, max: f32) -> bool {
+        let length = exit.u - front.u;
+        let end = if exit.z < front.z { exit.z } else { front.z };
+        end - 0.25 * self.span.bend * (length * length) > f64::from(max) + CLEARANCE_M
     }
 
-    /// A lower bound of the ray's height up to an exit.
+    /// Goes on behind a block of the present level.
     #[inline(always)]
-    fn lowest(&self, exit: &Exit) -> f64 {
-        let length = exit.u - self.u;
-        let end = if exit.z < self.z { exit.z } else { self.z };
-        end - 0.25 * self.span.bend * (length * length)
-    }
-
-    /// Goes on behind a block of the present level. `false` at the end of the stretch.
-    #[inline(always)]
-    fn pass(&mut self, exit: Exit) -> bool {
-        self.u = exit.u;
-        self.z = exit.z;
+    fn pass(&self, front: &mut Front, exit: Exit) -> Option<Halt> {
+        front.u = exit.u;
+        front.z = exit.z;
         if exit.ends {
-            return self.next_span(exit.u);
+            return Some(Halt::End);
         }
         let (axis, along) = (exit.axis, 1 - exit.axis);
-        let before = self.cell[axis];
+        let before = front.cell[axis];
         // Behind the exit line: the cell that begins there, or the one that ends there.
-        let after =
-            (((before >> self.level) + self.ahead[axis]) << self.level) - 1 + self.ahead[axis];
+        let line = ((before >> front.level) + self.ahead[axis]) << front.level;
+        let after = line - 1 + self.ahead[axis];
         if after < 0 || after >= self.ray.cells[axis] {
-            return false;
+            return Some(Halt::Edge);
         }
-        if self.level > 0 {
-            self.cell[along] = self.ray.cell_after(along, exit.u);
+        if front.level > 0 {
+            front.cell[along] = self.ray.cell_after(along, exit.u);
         }
-        self.cell[axis] = after;
-        if (before ^ after) >> (self.level + 1) != 0 && self.level < self.maxima.top() {
-            self.level += 1;
+        front.cell[axis] = after;
+        if (before ^ after) >> (front.level + 1) != 0 && front.level < self.top {
+            front.level += 1;
         }
-        true
+        None
     }
 
-    /// Goes on with the next span. `false` at the end of the stretch.
-    #[cold]
-    fn next_span(&mut self, u: f64) -> bool {
-        if u >= self.stretch.end_u {
-            return false;
-        }
-        self.span = self.path.next_span(&self.span);
-        self.limit = self.stretch.end_u.min(self.span.end_u);
-        self.cell = [self.ray.cell_after(0, u), self.ray.cell_after(1, u)];
-        true
-    }
-
-    /// Where the ray meets the cell that it is in, within the present span and stretch.
+    /// Where the ray meets a cell, from the first to the last of the course.
     #[inline(always)]
-    fn contact(&self, tile: &HeightTile) -> Option<Contact> {
-        let (ray, cell) = (&self.ray, self.cell);
+    fn contact(&self, tile: &HeightTile, cell: [i32; 2]) -> Option<Contact> {
+        let ray = self.ray;
         let corners = corners_in(tile, cell)?;
         let in_u = |axis| ray.line_u(axis, ray.entry_line(axis, cell[axis]));
         let out_u = |axis| ray.line_u(axis, ray.exit_line(axis, cell[axis]));
         let ([in_x, in_y], [out_x, out_y]) = ([in_u(0), in_u(1)], [out_u(0), out_u(1)]);
-        let first = self.stretch.start_u.max(self.span.start_u);
-        let last = self.limit;
+        let (first, last) = (self.first, self.last);
         let (in_axis, in_u) = if in_x > in_y { (0, in_x) } else { (1, in_y) };
         let (out_axis, out_u) = if out_x <= out_y { (0, out_x) } else { (1, out_y) };
         let (start_u, end_u) = (in_u.max(first), out_u.min(last));

@@ -70,9 +70,18 @@ impl Ground {
     }
 }
 
+/// Squared angle below which the series of [`sinc_versine`] may end early: 64 km.
+const SHORT_ARC: f64 = 1e-4;
+
 /// sinc(phi) and 1 - cos(phi) of a squared angle up to 0.04, by their series; the terms
-/// left out are below 1e-17.
+/// left out are below 1e-17 of the first.
+#[inline]
 fn sinc_versine(q: f64) -> (f64, f64) {
+    if q < SHORT_ARC {
+        let sinc = 1.0 + q * (-1.0 / 6.0 + q * (1.0 / 120.0 + q * (-1.0 / 5040.0)));
+        let versine = q * (0.5 + q * (-1.0 / 24.0 + q * (1.0 / 720.0 + q * (-1.0 / 40_320.0))));
+        return (sinc, versine);
+    }
     let sinc = 1.0
         + q * (-1.0 / 6.0
             + q * (1.0 / 120.0
