@@ -253,6 +253,10 @@ impl StoreIndex {
         if self.earth_radius_m.is_some_and(|radius| !(1e5..1e8).contains(&radius)) {
             return Err("the radius of the Earth is out of range".into());
         }
+        let errors = [self.report.max_resampling_error_m, self.report.rms_resampling_error_m];
+        if !errors.iter().all(|error| (0.0..=f64::MAX).contains(error)) {
+            return Err("a resampling error of its report is out of range".into());
+        }
         let mut tiles = 0;
         for (number, layer) in self.layers.iter().enumerate() {
             layer.check().map_err(|why| format!("layer {number}: {why}"))?;
