@@ -290,10 +290,12 @@ impl Layer {
             if level.tiles != tiles || level.entries.len() as u64 != expected {
                 return Err(format!("level {number} has the wrong number of tiles"));
             }
-            let sound = |e: &TileEntry| {
-                (e.is_empty()
-                    || (-MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M))
-                    && e.deviation >= 0.0
+            let sound = |e: &TileEntry| match e.is_empty() {
+                true => *e == TileEntry::EMPTY,
+                false => {
+                    let bounds = -MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M;
+                    bounds && e.deviation >= 0.0
+                }
             };
             if !level.entries.iter().all(sound) {
                 return Err(format!("level {number} has a bound that is out of range"));

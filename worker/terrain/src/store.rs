@@ -417,6 +417,21 @@ mod tests {
         }
     }
 
+    #[test]
+    fn an_empty_tile_that_claims_a_height_is_refused() {
+        let (_folder, path) = store();
+        let mut index = StoreReader::open(&path).unwrap().index().as_ref().clone();
+        let entry = &mut index.layers[0].levels[0].entries[0];
+        *entry = TileEntry::EMPTY;
+        assert!(decode_index(&postcard::to_stdvec(&index).unwrap()).is_ok());
+        for height in [f32::NAN, 0.0] {
+            let entry = &mut index.layers[0].levels[0].entries[0];
+            *entry = TileEntry { max: height, ..TileEntry::EMPTY };
+            let refused = decode_index(&postcard::to_stdvec(&index).unwrap()).unwrap_err();
+            assert!(refused.contains("bound"), "{refused}");
+        }
+    }
+
     proptest! {
         #[test]
         fn any_index_is_read_or_refused(at: prop::sample::Index, bytes in prop::collection::vec(any::<u8>(), 0..40)) {
