@@ -11,7 +11,7 @@ fn seeds() -> Vec<Vec<u8>> {
     let texts = [
         "EPSG:32612",
         "urn:ogc:def:crs:EPSG::3857",
-        "https://www.opengis.net/def/crs/EPSG/0/4326",
+        "http://www.opengis.net/def/crs/EPSG/0/4326",
         "LOCAL",
         "+proj=utm +zone=12 +datum=WGS84",
         "+proj=lcc +lat_1=49 +lat_2=46 +lat_0=47.5 +lon_0=13 +x_0=4e5 +y_0=4e5 +ellps=bessel \
