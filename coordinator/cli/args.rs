@@ -271,7 +271,12 @@ pub struct Coordinator {
 #[derive(Debug, ClapArgs)]
 pub struct Worker {
     /// The coordinator to work for
-    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR", default_value = "127.0.0.1:7070")]
+    #[arg(
+        long,
+        value_name = "HOST:PORT",
+        env = "TERRAFARM_COORDINATOR",
+        default_value = "127.0.0.1:7070"
+    )]
     pub coordinator: String,
     /// Name shown to people [default: this PC's name]
     #[arg(long)]

@@ -76,14 +76,7 @@ impl LocalFarm {
                 ended
             });
         }
-        Ok(LocalFarm {
-            address,
-            deserted,
-            stop_workers,
-            stop_coordinator,
-            workers,
-            coordinator,
-        })
+        Ok(LocalFarm { address, deserted, stop_workers, stop_coordinator, workers, coordinator })
     }
 
     /// Ends workers and coordinator, and waits for them.

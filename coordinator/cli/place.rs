@@ -18,8 +18,9 @@ pub struct StorePlace<'a> {
 impl<'a> StorePlace<'a> {
     /// Reads the reference system of a store.
     pub fn new(store: &'a StoreReader) -> anyhow::Result<Self> {
-        let crs = Crs::parse(&store.index().crs)
-            .with_context(|| format!("{}: cannot use its reference system", store.path().display()))?;
+        let crs = Crs::parse(&store.index().crs).with_context(|| {
+            format!("{}: cannot use its reference system", store.path().display())
+        })?;
         let info = summary(store);
         Ok(StorePlace { store, crs, bounds: Bounds { min: info.min, max: info.max } })
     }

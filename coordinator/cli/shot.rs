@@ -20,8 +20,8 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_coordinator::client::{self, ClientError, FrameFacts, Submission, Update};
 use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
-use terrafarm_film::OrderedFrames;
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
+use terrafarm_film::OrderedFrames;
 use terrafarm_terrain::store::{StoreReader, hash_of};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -97,7 +97,10 @@ impl Plan {
         let total = times.len() as u32;
         let (first, end) = choice.frames.unwrap_or((0, total));
         if first >= total {
-            bail!("--frames {first}..{end}: the flight has {total} frames at {} a second", choice.fps);
+            bail!(
+                "--frames {first}..{end}: the flight has {total} frames at {} a second",
+                choice.fps
+            );
         }
         let cameras = times
             .skip(first as usize)
@@ -202,7 +205,8 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let (updates, inbox) = mpsc::channel(2 * in_flight + 8);
     let (taken, taken_out) = mpsc::channel(in_flight + 8);
     let bar = progress::bar("frames", u64::from(spec.frames));
-    let desk = Desk { spec, first: plan.first_frame, poster: plan.poster.clone(), bar: bar.clone() };
+    let desk =
+        Desk { spec, first: plan.first_frame, poster: plan.poster.clone(), bar: bar.clone() };
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
     let submission = Submission {
         name: plan.name.clone(),

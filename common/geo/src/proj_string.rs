@@ -10,7 +10,8 @@ pub(crate) struct ProjString {
 
 impl ProjString {
     /// Splits `+name=value` words; the plus signs may be missing. Values keep their
-    /// case, names are lower-cased except for the few that differ only by case.
+    /// case, names are lower-cased except for the few that differ only by case. Of
+    /// several words with one name the first counts, as in PROJ.
     pub(crate) fn parse(text: &str) -> Self {
         let mut parsed = ProjString::default();
         for word in text.split_ascii_whitespace() {
@@ -19,12 +20,12 @@ impl ProjString {
                 Some((name, value)) => (name, Some(value.trim_matches('"').to_owned())),
                 None => (word, None),
             };
-            if name.is_empty() || parsed.get(name).is_some() {
-                continue;
-            }
             // R and r, R_A and R_a mean different things.
             let name = if name.starts_with('R') { name.into() } else { name.to_lowercase() };
-            parsed.parameters.push((name, value));
+            let is_known = parsed.parameters.iter().any(|(known, _)| *known == name);
+            if !name.is_empty() && !is_known {
+                parsed.parameters.push((name, value));
+            }
         }
         parsed
     }
@@ -85,5 +86,23 @@ impl fmt::Display for ProjString {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_several_words_with_one_name_the_first_counts_whatever_its_case() {
+        let parsed = ProjString::parse("+proj=tmerc +lon_0=9 +Lon_0=10 +south +south=1 +south");
+        assert_eq!(parsed.to_string(), "+proj=tmerc +lon_0=9 +south");
+        assert_eq!(ProjString::parse(&parsed.to_string()), parsed);
+    }
+
+    #[test]
+    fn names_that_differ_only_by_case_stay_apart() {
+        let text = "+proj=merc +R=6370997 +R_A +r=1";
+        assert_eq!(ProjString::parse(text).to_string(), text);
     }
 }

@@ -64,7 +64,9 @@ fn print_next(folder: &Path) {
     println!("Next:");
     println!("  open {folder}/demo.mp4 in a browser");
     println!("  edit {folder}/demo.csv (the flight) or {folder}/demo.toml (the light), then");
-    println!("    terrafarm render {folder}/demo.toml --flight {folder}/demo.csv -o {folder}/mine.mp4");
+    println!(
+        "    terrafarm render {folder}/demo.toml --flight {folder}/demo.csv -o {folder}/mine.mp4"
+    );
     println!("  bring your own terrain:");
     println!("    terrafarm terrain import YOUR_DEM.tif --photo YOUR_PHOTO.tif -o yours.terrain");
 }

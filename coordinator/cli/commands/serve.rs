@@ -43,8 +43,7 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
         coordinator: args.coordinator,
         name: args.name.unwrap_or_else(pc_name),
         threads: args.threads.unwrap_or(cores) as usize,
-        cache_dir: (args.cache_limit > 0)
-            .then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
+        cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
@@ -92,9 +91,12 @@ fn default_cache_dir() -> PathBuf {
 }
 
 fn pc_name() -> String {
-    let from_environment = ["HOSTNAME", "COMPUTERNAME"].iter().find_map(|name| std::env::var(name).ok());
+    let from_environment =
+        ["HOSTNAME", "COMPUTERNAME"].iter().find_map(|name| std::env::var(name).ok());
     from_environment
-        .or_else(|| std::fs::read_to_string("/etc/hostname").ok().map(|name| name.trim().to_owned()))
+        .or_else(|| {
+            std::fs::read_to_string("/etc/hostname").ok().map(|name| name.trim().to_owned())
+        })
         .filter(|name| !name.is_empty())
         .unwrap_or_else(|| "worker".into())
 }

@@ -18,8 +18,10 @@ pub fn run(args: &args::Simulate) -> anyhow::Result<Outcome> {
     }
     let report = sim::simulate(&config);
     if let Some(path) = &args.json {
-        let text = serde_json::to_string_pretty(&report).context("cannot write the report as JSON")?;
-        std::fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))?;
+        let text =
+            serde_json::to_string_pretty(&report).context("cannot write the report as JSON")?;
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
     println!(
         "{} workers, {} frames, seed {}: {:.1} virtual seconds, efficiency {:.1} %",
@@ -41,6 +43,8 @@ pub fn run(args: &args::Simulate) -> anyhow::Result<Outcome> {
     if let Some(violation) = &report.first_violation {
         bail!("the scheduler broke a promise: {violation}; please report it with the seed");
     }
-    println!("every frame complete once, no pixel lost or doubled, no lease held twice unless on purpose");
+    println!(
+        "every frame complete once, no pixel lost or doubled, no lease held twice unless on purpose"
+    );
     Ok(Outcome::Done)
 }

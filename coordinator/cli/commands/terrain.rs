@@ -117,7 +117,10 @@ fn print_import(args: &args::Import, done: &ImportSummary) -> anyhow::Result<()>
         ),
     };
     println!("{}: {}, {error}", args.output.display(), done.crs);
-    println!("look at it:  terrafarm terrain hillshade {0} -o hillshade.png", args.output.display());
+    println!(
+        "look at it:  terrafarm terrain hillshade {0} -o hillshade.png",
+        args.output.display()
+    );
     Ok(())
 }
 
@@ -131,7 +134,11 @@ fn print_info(info: &StoreInfo) {
     const MIB: f64 = 1048576.0;
     let [[x0, y0], [x1, y1]] = [info.min, info.max];
     println!("crs           {}", info.crs);
-    println!("extent        {x0:.2} {y0:.2} to {x1:.2} {y1:.2} ({:.1} x {:.1} km)", (x1 - x0) / 1e3, (y1 - y0) / 1e3);
+    println!(
+        "extent        {x0:.2} {y0:.2} to {x1:.2} {y1:.2} ({:.1} x {:.1} km)",
+        (x1 - x0) / 1e3,
+        (y1 - y0) / 1e3
+    );
     println!("height datum  {:?}", info.height_datum);
     match info.height_range_m {
         Some([low, high]) => println!("heights       {low} to {high} m"),
@@ -203,11 +210,8 @@ pub fn write_synth(path: &Path, spec: SynthSpec, force: bool) -> anyhow::Result<
 
 fn write_hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> anyhow::Result<()> {
     let reader = StoreReader::open(store)?;
-    let (number, layer) = reader
-        .index()
-        .layers_of(LayerKind::Height)
-        .next()
-        .context("the store has no heights")?;
+    let (number, layer) =
+        reader.index().layers_of(LayerKind::Height).next().context("the store has no heights")?;
     let [width, height] = layer.posts;
     if layer.posts.iter().any(|&side| side > u64::from(MAX_SIDE_PX)) {
         bail!("{width} x {height} posts make too large a picture; at most {MAX_SIDE_PX} a side");
@@ -224,7 +228,10 @@ fn write_hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> 
 
 fn refuse_existing(path: &Path, force: bool) -> anyhow::Result<()> {
     if path.exists() && !force {
-        bail!("{} exists already; choose another name, or say --force to replace it", path.display());
+        bail!(
+            "{} exists already; choose another name, or say --force to replace it",
+            path.display()
+        );
     }
     Ok(())
 }

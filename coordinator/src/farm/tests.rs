@@ -151,7 +151,10 @@ fn pixels_of_the_wrong_number_fail_the_job_and_not_the_farm() {
     let out = bench.submit(1);
     let grant = grants(&out)[0].1;
     let short = Done { pixels: Pixels::raw(Bytes::from(vec![0; 3])).unwrap(), ..done(&grant) };
-    let mut out: Vec<_> = out.into_iter().filter(|o| !matches!(o, Out::Send(_, Message::Grant(g)) if g.lease == grant.lease)).collect();
+    let mut out: Vec<_> = out
+        .into_iter()
+        .filter(|o| !matches!(o, Out::Send(_, Message::Grant(g)) if g.lease == grant.lease))
+        .collect();
     out.extend(bench.say(worker(1), short));
     out.extend(bench.join(worker(2), 1));
     assert_eq!(render_all(&mut bench, out).len(), 1);
@@ -228,7 +231,8 @@ fn terrain_goes_from_the_client_to_every_worker_that_wants_it() {
     assert_eq!(out.len(), 2);
     let wrong = BlobHash([9; 32]);
     bench.say(worker(1), WantBlobs { hashes: vec![wrong] });
-    let out = bench.say(Peer::Client(CLIENT), Blob { hash: wrong, bytes: Bytes::from_static(b"x") });
+    let out =
+        bench.say(Peer::Client(CLIENT), Blob { hash: wrong, bytes: Bytes::from_static(b"x") });
     assert!(matches!(&out[..], [Out::Send(Peer::Worker(_), Message::NoBlob(_))]), "{out:?}");
 }
 
@@ -248,6 +252,7 @@ fn cameras_that_do_not_fit_reject_the_shot() {
     bench.join(worker(1), 1);
     bench.submit(1);
     let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, (8, 8));
-    let out = bench.say(Peer::Client(CLIENT), Cameras { number: 7, first: 0, cameras: vec![camera] });
+    let out =
+        bench.say(Peer::Client(CLIENT), Cameras { number: 7, first: 0, cameras: vec![camera] });
     assert!(matches!(&out[..], [Out::Send(_, Message::Rejected(_))]), "{out:?}");
 }

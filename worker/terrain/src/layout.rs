@@ -253,6 +253,10 @@ impl StoreIndex {
         if self.earth_radius_m.is_some_and(|radius| !(1e5..1e8).contains(&radius)) {
             return Err("the radius of the Earth is out of range".into());
         }
+        let errors = [self.report.max_resampling_error_m, self.report.rms_resampling_error_m];
+        if !errors.iter().all(|error| (0.0..=f64::MAX).contains(error)) {
+            return Err("a resampling error of its report is out of range".into());
+        }
         let mut tiles = 0;
         for (number, layer) in self.layers.iter().enumerate() {
             layer.check().map_err(|why| format!("layer {number}: {why}"))?;
@@ -286,10 +290,12 @@ impl Layer {
             if level.tiles != tiles || level.entries.len() as u64 != expected {
                 return Err(format!("level {number} has the wrong number of tiles"));
             }
-            let sound = |e: &TileEntry| {
-                (e.is_empty()
-                    || (-MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M))
-                    && e.deviation >= 0.0
+            let sound = |e: &TileEntry| match e.is_empty() {
+                true => *e == TileEntry::EMPTY,
+                false => {
+                    let bounds = -MAX_HEIGHT_M <= e.min && e.min <= e.max && e.max <= MAX_HEIGHT_M;
+                    bounds && e.deviation >= 0.0
+                }
             };
             if !level.entries.iter().all(sound) {
                 return Err(format!("level {number} has a bound that is out of range"));

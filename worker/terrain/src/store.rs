@@ -401,6 +401,37 @@ mod tests {
         assert!(matches!(StoreReader::open(&path), Err(StoreError::Io { .. })));
     }
 
+    #[test]
+    fn an_index_whose_report_is_no_number_is_refused() {
+        let (_folder, path) = store();
+        let sound = StoreReader::open(&path).unwrap().index().as_ref().clone();
+        for error in [f64::NAN, f64::INFINITY, -1.0] {
+            for axis in 0..2 {
+                let mut index = sound.clone();
+                let report = &mut index.report;
+                *[&mut report.max_resampling_error_m, &mut report.rms_resampling_error_m][axis] =
+                    error;
+                let refused = decode_index(&postcard::to_stdvec(&index).unwrap()).unwrap_err();
+                assert!(refused.contains("resampling error"), "{refused}");
+            }
+        }
+    }
+
+    #[test]
+    fn an_empty_tile_that_claims_a_height_is_refused() {
+        let (_folder, path) = store();
+        let mut index = StoreReader::open(&path).unwrap().index().as_ref().clone();
+        let entry = &mut index.layers[0].levels[0].entries[0];
+        *entry = TileEntry::EMPTY;
+        assert!(decode_index(&postcard::to_stdvec(&index).unwrap()).is_ok());
+        for height in [f32::NAN, 0.0] {
+            let entry = &mut index.layers[0].levels[0].entries[0];
+            *entry = TileEntry { max: height, ..TileEntry::EMPTY };
+            let refused = decode_index(&postcard::to_stdvec(&index).unwrap()).unwrap_err();
+            assert!(refused.contains("bound"), "{refused}");
+        }
+    }
+
     proptest! {
         #[test]
         fn any_index_is_read_or_refused(at: prop::sample::Index, bytes in prop::collection::vec(any::<u8>(), 0..40)) {

@@ -38,12 +38,15 @@ pub fn run(store: &Path, points: &Path) -> anyhow::Result<()> {
     let columns = find_columns(&header).with_context(|| format!("{name}, line 1"))?;
     writeln!(output, "{header},height_m")?;
     let mut number = 1;
-    while let Some(line) = next_line(&mut input).with_context(|| format!("{name}, line {}", number + 1))? {
+    while let Some(line) =
+        next_line(&mut input).with_context(|| format!("{name}, line {}", number + 1))?
+    {
         number += 1;
         if line.trim().is_empty() {
             continue;
         }
-        let [x, y] = position(&line, &columns, &crs).with_context(|| format!("{name}, line {number}"))?;
+        let [x, y] =
+            position(&line, &columns, &crs).with_context(|| format!("{name}, line {number}"))?;
         match sampler.height_at(x, y)? {
             // f64 prints the shortest digits that read back the same.
             Some(height) => writeln!(output, "{line},{height}")?,

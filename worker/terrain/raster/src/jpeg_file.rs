@@ -14,6 +14,10 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 /// Passes over the picture that a progressive file may ask for.
 const MAX_SCANS: usize = 64;
+/// The most pixels that one byte of a file can hold. A block of 8 x 8 samples takes a bit
+/// at least, and the component with the most samples has one for every four pixels or
+/// more. A file that declares more cannot be whole.
+const MAX_PIXELS_PER_BYTE: u64 = 8 * 64 * 4;
 
 /// Opens a JPEG.
 ///
@@ -26,6 +30,7 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
         return Err(RasterError::unsupported(path, what));
     }
     let bytes = source.whole(MAX_WHOLE_FILE_BYTES)?;
+    let length = bytes.len() as u64;
     let settings = DecoderOptions::new_safe()
         .set_strict_mode(true)
         .set_max_width(1 << 16)
@@ -46,6 +51,13 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
         .map(|info| (u64::from(info.width), u64::from(info.height)))
         .ok_or_else(|| RasterError::damaged(path, "the JPEG header is damaged"))?;
     check_size(path, width, height)?;
+    if width * height > length * MAX_PIXELS_PER_BYTE {
+        let what = format!(
+            "the picture is declared as {width} x {height} pixels, which cannot be in a file of \
+             {length} bytes; it is cut short or damaged: fetch it again"
+        );
+        return Err(RasterError::damaged(path, what));
+    }
     let pixels = decoder.decode().map_err(damaged)?;
     if pixels.len() as u64 != width * height * 3 {
         let what = format!("this kind of JPEG is not read; {}", conversion_hint(path));

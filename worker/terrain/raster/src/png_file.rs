@@ -15,6 +15,9 @@ use std::path::Path;
 
 /// Memory that the decoder may take besides the picture itself, bytes.
 const DECODER_BYTES: usize = 64 << 20;
+/// The most bytes that one byte of DEFLATE can unpack to: a bit for each of four matches
+/// of 258 bytes. A file that declares more than that cannot be whole.
+const MAX_EXPANSION: u64 = 1032;
 /// Half the length of the equator on the sphere of web maps, metres.
 const WEB_MERCATOR_EDGE_M: f64 = 20_037_508.342_789_244;
 /// The finest zoom level that a tile number may have.
@@ -87,7 +90,17 @@ fn header(path: &Path, bytes: &[u8]) -> Result<(ColorType, BitDepth), RasterErro
     let info = decoder.read_header_info().map_err(|error| {
         RasterError::damaged(path, format!("the PNG header is damaged: {error}"))
     })?;
-    check_size(path, u64::from(info.width), u64::from(info.height))?;
+    let (width, height) = (u64::from(info.width), u64::from(info.height));
+    check_size(path, width, height)?;
+    let packed = (width * height * info.bits_per_pixel() as u64).div_ceil(8);
+    if packed > bytes.len() as u64 * MAX_EXPANSION {
+        let what = format!(
+            "the picture is declared as {width} x {height} pixels, which cannot be in a file of \
+             {} bytes; it is cut short or damaged: fetch it again",
+            bytes.len()
+        );
+        return Err(RasterError::damaged(path, what));
+    }
     Ok((info.color_type, info.bit_depth))
 }
 
@@ -394,6 +407,26 @@ mod tests {
         // The header's checksum no longer fits; either reason is a refusal.
         assert!(open(memory("bomb.png", bytes), &OpenOptions::default()).is_err());
         assert!(check_size(Path::new("a"), 1_000_000_000, 1_000_000_000).is_err());
+    }
+
+    #[test]
+    fn a_size_that_cannot_be_in_so_short_a_file_is_refused_before_memory_is_asked_for() {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, 1 << 13, 1 << 13);
+        encoder.set_color(ColorType::Rgba);
+        encoder.write_header().unwrap();
+        let error = open(memory("a.png", bytes), &OpenOptions::default()).err().unwrap();
+        assert!(error.to_string().contains("cannot be in a file"), "{error}");
+    }
+
+    #[test]
+    fn a_flat_picture_packed_as_tightly_as_can_be_is_read() {
+        let (side, mut bytes) = (1 << 12, Vec::new());
+        let mut encoder = png::Encoder::new(&mut bytes, side, side);
+        encoder.set_compression(png::Compression::High);
+        encoder.write_header().unwrap().write_image_data(&vec![0; 1 << 24]).unwrap();
+        assert!(bytes.len() < 1 << 15, "{} bytes", bytes.len());
+        assert!(open(memory("a.png", bytes), &OpenOptions::default()).is_ok());
     }
 
     proptest! {

@@ -1,7 +1,8 @@
 //! Damaged, cut and hostile files give an error or a raster, never a panic.
 
 use crate::support::{
-    TiffVariant, all_heights, heights_wanted, memory, photo_wanted, tiff_variants, tiny_tiff,
+    TiffVariant, all_colors, all_heights, heights_wanted, memory, photo_wanted, tiff_variants,
+    tiny_jpeg, tiny_tiff,
 };
 use proptest::prelude::*;
 use terrafarm_raster::{OpenOptions, RasterError, Window, open_source};
@@ -122,6 +123,20 @@ fn hostile_sizes_are_refused_with_a_reason() {
         let error = attempt("a.tif", &damaged).unwrap_err().to_string();
         assert!(error.contains(reason), "tag {tag} = {value}: {error}");
         assert!(error.starts_with("a.tif: "), "{error}");
+    }
+}
+
+#[test]
+fn a_jpeg_that_declares_more_pixels_than_its_bytes_can_hold_is_refused() {
+    for sampling in [0x11, 0x22] {
+        let bytes = tiny_jpeg(3, sampling);
+        let raster = open_source(memory("a.jpg", bytes.clone()), &photo_wanted()).unwrap();
+        assert_eq!(all_colors(&*raster).unwrap(), [[128, 128, 128, 255]; 256]);
+        let mut hostile = bytes;
+        let size = hostile.windows(4).position(|bytes| bytes == [0, 16, 0, 16]).unwrap();
+        hostile[size..size + 4].copy_from_slice(&[0x40, 0, 0x40, 0]);
+        let error = open_source(memory("a.jpg", hostile), &photo_wanted()).err().unwrap();
+        assert!(error.to_string().contains("cannot be in a file"), "{error}");
     }
 }
 
