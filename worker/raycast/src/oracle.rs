@@ -1,14 +1,23 @@
-//! Tests of `exact` against everything that knows better: its slow twin, rational
-//! arithmetic, spherical trigonometry, and itself under another split.
+//! Tests of the pictures against everything that knows better: the slow twin, rational
+//! arithmetic, spherical trigonometry, and the same picture under another split.
+//!
+//! They use what the crate offers to others and nothing else. `TERRAFARM_LONG=1` casts
+//! twenty times as many rays.
 
+mod fractions;
+mod horizons;
+mod moire;
+mod pictures;
 mod same_cells;
+mod watertight;
 
-use crate::exact::Exact;
-use crate::field::{Contact, Field, Outcome};
-use crate::path::Path;
-use crate::pyramid::Pyramid;
-use crate::reference::Reference;
 use crate::tests_support::{Plan, mountains, noise, resident};
+use crate::{Hit, Pyramid, Rendered, View, cast, render};
+use glam::DVec3;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::quality::{Method, Quality};
+use terrafarm_common::region::Region;
+use terrafarm_common::shading::{Earth, Shading, Sky};
 use terrafarm_terrain::resident::Resident;
 
 /// A store with its pyramid.
@@ -25,12 +34,69 @@ impl Land {
         Land { name, resident, pyramid }
     }
 
-    pub(crate) fn field(&self) -> Field<'_> {
-        Field { resident: &self.resident, pyramid: &self.pyramid }
+    /// What a ray meets; its direction need not be of unit length.
+    pub(crate) fn cast(
+        &self,
+        method: Method,
+        earth: Option<Earth>,
+        start: DVec3,
+        direction: DVec3,
+    ) -> Option<Hit> {
+        // The ray through the middle of a picture of one pixel is `forward`, to the bit.
+        let camera = Camera {
+            position: start,
+            right: DVec3::X,
+            up: DVec3::Z,
+            forward: direction,
+            tan_half_hfov: 1.0,
+            width: 1,
+            height: 1,
+        };
+        let quality = Quality { method, samples_per_side: 1 };
+        let view = View { camera, shading: bare(earth), quality };
+        self.look(&view, [0.5, 0.5])
+    }
+
+    /// What is seen at a point of a picture.
+    pub(crate) fn look(&self, view: &View, [x_px, y_px]: [f64; 2]) -> Option<Hit> {
+        cast(&self.resident, &self.pyramid, view, x_px, y_px).expect("all tiles are loaded")
+    }
+
+    /// The surface right below or above a place, looked for from `top`.
+    pub(crate) fn height(&self, x: f64, y: f64, top: f64) -> Option<f64> {
+        let start = DVec3::new(x, y, top);
+        self.cast(Method::Reference, None, start, DVec3::NEG_Z).map(|hit| hit.height)
+    }
+
+    pub(crate) fn render(&self, view: &View, region: Region) -> Rendered {
+        let rendered = render(&self.resident, &self.pyramid, view, region);
+        assert!(rendered.missing.is_empty(), "all tiles are loaded");
+        rendered
     }
 }
 
-/// Terrains of every sort, with posts at whole metres.
+/// No sun and no haze.
+pub(crate) fn bare(earth: Option<Earth>) -> Shading {
+    Shading {
+        sun: None,
+        haze: None,
+        sky: Sky::default(),
+        earth,
+        below_ground: [0.5, 0.0, 0.5],
+        bare_ground: None,
+    }
+}
+
+/// A number of rays or rounds, twenty times as many in the long form.
+pub(crate) fn count(short: u64) -> u64 {
+    if std::env::var_os("TERRAFARM_LONG").is_some_and(|value| value != "0") {
+        20 * short
+    } else {
+        short
+    }
+}
+
+/// Terrains of every sort, most with posts at whole metres.
 pub(crate) fn lands() -> Vec<Land> {
     let rough = |i, j| 40.0 * noise(i, j, 1);
     let smooth = |i, j| mountains(i, j, 64, 60.0, 2);
@@ -42,6 +108,10 @@ pub(crate) fn lands() -> Vec<Land> {
     let voids = |i: u64, j: u64| {
         if noise(i / 3, j / 3, 7) > 0.4 { f32::NAN } else { 20.0 * noise(i, j, 8) }
     };
+    let gap = |i: u64, j: u64| {
+        let void = (250..530).contains(&i) && j < 270;
+        if void { f32::NAN } else { smooth(i, j) }
+    };
     let single = |spacing, posts, height: &dyn Fn(u64, u64) -> f32| {
         vec![Plan::heights([-20.0, -30.0], spacing, posts, height)]
     };
@@ -51,6 +121,10 @@ pub(crate) fn lands() -> Vec<Land> {
         Plan::heights([25.0, -30.0], [0.5, 0.25], [20, 90], voids),
         Plan::heights([97.0, 0.0], [1.0, 1.0], [9, 9], rough),
     ];
+    let utm = vec![
+        Plan::heights([562_000.0, 5_117_000.0], [30.0, 30.0], [300, 280], smooth),
+        Plan::heights([564_000.25, 5_119_000.5], [10.0, 10.0], [60, 60], smooth),
+    ];
     vec![
         Land::new("rough", single([1.0, 1.0], [65, 65], &rough)),
         Land::new("smooth", single([1.0, 1.0], [65, 65], &smooth)),
@@ -59,9 +133,13 @@ pub(crate) fn lands() -> Vec<Land> {
         Land::new("voids", single([1.0, 1.0], [65, 65], &voids)),
         Land::new("stretched", single([3.0, 1.0], [30, 80], &rough)),
         Land::new("two by two", single([7.0, 5.0], [2, 2], &rough)),
+        Land::new("one by many", single([2.0, 2.0], [1, 50], &rough)),
+        Land::new("two by many", single([2.0, 2.0], [2, 90], &rough)),
         Land::new("strip", single([1.0, 1.0], [300, 5], &smooth)),
         Land::new("insets", insets),
+        Land::new("utm", utm),
         Land::new("tiles", single([1.0, 1.0], [600, 530], &smooth)),
+        Land::new("void tiles", single([1.0, 1.0], [600, 530], &gap)),
     ]
 }
 
@@ -89,37 +167,9 @@ impl Dice {
     pub(crate) fn below(&mut self, n: u64) -> u64 {
         ((self.unit() * n as f64) as u64).min(n - 1)
     }
-}
 
-pub(crate) fn exact(land: &Land, path: &Path) -> Option<Contact> {
-    answer(Exact::new(land.field()).cast(path, 0.0))
-}
-
-pub(crate) fn answer(outcome: Outcome) -> Option<Contact> {
-    match outcome {
-        Outcome::Hit(contact) => Some(contact),
-        Outcome::Miss => None,
-        Outcome::Unfinished => panic!("all tiles are loaded"),
-    }
-}
-
-/// Casts one ray by both methods and compares cells and places.
-pub(crate) fn compare(
-    exact: &mut Exact,
-    reference: &mut Reference,
-    path: &Path,
-) -> Result<bool, String> {
-    let (found, truth) = (answer(exact.cast(path, 0.0)), answer(reference.cast(path)));
-    let same = match (&found, &truth) {
-        (None, None) => true,
-        (Some(a), Some(b)) => {
-            (a.layer, a.cell) == (b.layer, b.cell) && (a.u - b.u).abs() <= 1e-6 * (1.0 + b.u)
-        }
-        _ => false,
-    };
-    if same {
-        Ok(found.is_some())
-    } else {
-        Err(format!("{:?} {:?}: {found:?} instead of {truth:?}", path.origin, path.direction))
+    /// A whole number from `low` to `high`, both included.
+    pub(crate) fn whole(&mut self, low: i64, high: i64) -> i64 {
+        low + self.below((high - low + 1) as u64) as i64
     }
 }

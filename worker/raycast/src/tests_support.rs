@@ -52,6 +52,15 @@ fn places(posts: [u64; 2]) -> impl Iterator<Item = (u64, u64)> {
 
 /// A store with all of its tiles loaded. Heights first, as an index has them.
 pub fn resident(plans: Vec<Plan>) -> Resident {
+    let (mut resident, tiles) = store(plans);
+    for (key, tile) in tiles {
+        assert!(resident.insert(key, tile));
+    }
+    resident
+}
+
+/// A store without any tile in memory, and all of its tiles that are not empty.
+pub fn store(plans: Vec<Plan>) -> (Resident, Vec<(TileKey, Tile)>) {
     let mut tiles = Vec::new();
     let mut layers = Vec::new();
     for (number, plan) in plans.into_iter().enumerate() {
@@ -66,11 +75,7 @@ pub fn resident(plans: Vec<Plan>) -> Resident {
         report: ImportReport::default(),
     };
     index.check().expect("the plans make a sound index");
-    let mut resident = Resident::new(Arc::new(index));
-    for (key, tile) in tiles {
-        assert!(resident.insert(key, tile));
-    }
-    resident
+    (Resident::new(Arc::new(index)), tiles)
 }
 
 /// All tiles of a store that are not empty.
