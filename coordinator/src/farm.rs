@@ -133,10 +133,13 @@ impl Farm {
                 self.schedule(now, Event::WorkerJoined { worker, threads });
             }
             PeerEvent::Gone(why, how) => {
+                let held = self.workers.get(&worker).map_or(0, |state| state.leases.len());
                 if let Some(name) = self.forget_worker(worker) {
                     match why {
                         LostReason::Left => tracing::info!(%worker, %name, "worker left: {how}"),
-                        _ => tracing::warn!(%worker, %name, "worker lost: {how}"),
+                        // Nobody waits for it: no reason to alarm anyone.
+                        _ if held == 0 => tracing::info!(%worker, %name, "worker lost: {how}"),
+                        _ => tracing::warn!(%worker, %name, held, "worker lost: {how}"),
                     }
                 }
                 self.schedule(now, Event::WorkerLost { worker, why });

@@ -11,7 +11,7 @@ use std::path::Path;
 use terrafarm_synth::SynthSpec;
 
 /// Terrain of the demo: the seed was chosen for its lake and its ridge.
-const TERRAIN: SynthSpec = SynthSpec { posts: 2049, spacing_m: 18.0, seed: 1, photo_scale: 1 };
+const TERRAIN: SynthSpec = SynthSpec { posts: 2049, spacing_m: 15.0, seed: 3, photo_scale: 2 };
 /// The light of the demo.
 const SCENE: &str = include_str!("../../../deploy/scenes/demo.toml");
 /// The flight of the demo.
@@ -21,7 +21,7 @@ const SIZE: (u32, u32) = (1280, 720);
 /// Frames per second.
 const FPS: f64 = 24.0;
 /// The frame kept as a picture.
-const POSTER: u32 = 120;
+const POSTER: u32 = 30;
 
 /// Makes terrain, renders a flight, leaves a video.
 pub fn run(args: &args::Demo) -> anyhow::Result<Outcome> {
