@@ -21,9 +21,10 @@
 //! Height grows both with the square of the map distance and with the straight rise (see
 //! `path`), so it is bounded from below over an interval of depths by the least of both.
 
-use crate::field::{Field, Ground, tile_key};
+use crate::field::{Cursor, Field, Ground, tile_key};
 use crate::grid::cells_of;
 use crate::path;
+use crate::pyramid::Pyramid;
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -54,6 +55,7 @@ pub(crate) struct Beams<'a> {
     camera: &'a Camera,
     ground: path::Ground,
     layers: Vec<Grid>,
+    tiles: Cursor<'a>,
     first_step: f64,
     /// Intervals of depth looked at.
     pub steps: u64,
@@ -103,7 +105,7 @@ impl<'a> Beams<'a> {
             Grid { number, eye, scale, cells }
         });
         let layers = layers.collect();
-        Beams { field, camera, ground, layers, first_step, steps: 0 }
+        Beams { field, camera, ground, layers, tiles: Cursor::new(field), first_step, steps: 0 }
     }
 
     /// Calls `see` for each pixel of a square with the depth up to which every ray
@@ -205,7 +207,9 @@ impl<'a> Beams<'a> {
     }
 
     /// Whether all ground below a beam from depth `start` to `end` is lower than `lowest`.
-    fn is_clear(&self, bounds: &Bounds, start: f64, end: f64, lowest: f64) -> bool {
+    fn is_clear(&mut self, bounds: &Bounds, start: f64, end: f64, lowest: f64) -> bool {
+        let pyramid = self.field.pyramid;
+        let tiles = &mut self.tiles;
         self.layers.iter().all(|grid| {
             let mut first = [0; 2];
             let mut last = [0; 2];
@@ -221,17 +225,26 @@ impl<'a> Beams<'a> {
                 first[axis] = ((low - margin) as i32).max(0);
                 last[axis] = ((high + margin) as i32).min(grid.cells[axis] - 1);
             }
-            self.is_below(grid, first, last, lowest)
+            grid.is_below(pyramid, tiles, first, last, lowest)
         })
     }
+}
 
+impl Grid {
     /// Whether the cells from `first` to `last` are lower than `lowest`: by at most four
     /// blocks that cover them.
-    fn is_below(&self, grid: &Grid, first: [i32; 2], last: [i32; 2], lowest: f64) -> bool {
-        if grid.cells.contains(&0) {
+    fn is_below(
+        &self,
+        pyramid: &Pyramid,
+        tiles: &mut Cursor,
+        first: [i32; 2],
+        last: [i32; 2],
+        lowest: f64,
+    ) -> bool {
+        if self.cells.contains(&0) {
             return true;
         }
-        let maxima = self.field.pyramid.layer(grid.number);
+        let maxima = pyramid.layer(self.number);
         let side = (last[0] - first[0]).max(last[1] - first[1]).max(1) as u32;
         let level = (side.ilog2() as usize + usize::from(!side.is_power_of_two())).max(1);
         let level = level.min(maxima.top());
@@ -244,7 +257,7 @@ impl<'a> Beams<'a> {
                 } else {
                     let cell = [bi << level, bj << level];
                     let tile = |index: i32| index as usize >> MAXIMA_LEVELS;
-                    match self.field.ground(tile_key(grid.number, cell)) {
+                    match tiles.ground(tile_key(self.number, cell)) {
                         Ground::Loaded(loaded) => {
                             let within = |index: i32| (index as usize & (TILE_CELLS - 1)) >> level;
                             loaded.block_max(level, within(cell[0]), within(cell[1]))
@@ -263,3 +276,6 @@ impl<'a> Beams<'a> {
         true
     }
 }
+
+#[cfg(test)]
+mod tests;

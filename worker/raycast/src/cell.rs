@@ -25,7 +25,8 @@ impl Corners {
     /// `None` for a cell that has no surface: a corner is void.
     #[inline(always)]
     pub(crate) fn new(heights: [f32; 4]) -> Option<Self> {
-        let heights = heights.map(f64::from);
+        let [sw, se, nw, ne] = heights;
+        let heights = [f64::from(sw), f64::from(se), f64::from(nw), f64::from(ne)];
         let sum = heights[0] + heights[1] + heights[2] + heights[3];
         sum.is_finite().then_some(Corners { heights })
     }
@@ -90,7 +91,8 @@ impl Corners {
 /// Where in a cell the ray is at `u`, 0 to 1 along each axis.
 #[inline]
 pub(crate) fn place_in_cell(ray: &GridRay, cell: [i32; 2], u: f64) -> [f64; 2] {
-    [0, 1].map(|axis| (ray.position(axis, u) - f64::from(cell[axis])).clamp(0.0, 1.0))
+    let along = |axis| (ray.position(axis, u) - f64::from(cell[axis])).clamp(0.0, 1.0);
+    [along(0), along(1)]
 }
 
 #[inline(always)]

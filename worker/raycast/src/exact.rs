@@ -19,12 +19,12 @@
 
 use crate::cell::{first_contact, place_in_cell};
 use crate::field::{
-    Contact, Field, Ground, Outcome, Stretch, Wanted, corners_in, next_stretch, tile_key,
+    Contact, Cursor, Field, Ground, Outcome, Stretch, Wanted, corners_in, next_stretch, tile_key,
 };
 use crate::grid::GridRay;
 use crate::path::{Path, Span};
 use crate::pyramid::LayerMaxima;
-use terrafarm_terrain::layout::{TILE_CELLS, TileKey};
+use terrafarm_terrain::layout::TILE_CELLS;
 use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
 
 /// How far above a block's maximum a ray must stay for the block to be skipped, metres.
@@ -34,11 +34,11 @@ const CLEARANCE_M: f64 = 1e-6;
 /// close to the ground, and 4 takes a quarter longer over a steep view.
 const FIRST_LEVEL: usize = 2;
 
-/// Casts rays, one after another, and remembers the tile that the last one touched.
+/// Casts rays, one after another.
 pub(crate) struct Exact<'a> {
     field: Field<'a>,
     rays: Vec<(usize, GridRay)>,
-    tile: (TileKey, Ground<'a>),
+    tiles: Cursor<'a>,
     /// Tiles that were needed but not loaded.
     pub wanted: Wanted,
     /// Blocks and cells looked at.
@@ -95,11 +95,10 @@ enum Halt {
 
 impl<'a> Exact<'a> {
     pub(crate) fn new(field: Field<'a>) -> Self {
-        let nowhere = TileKey { layer: u16::MAX, level: 0, tx: 0, ty: 0 };
         Exact {
             field,
             rays: Vec::new(),
-            tile: (nowhere, Ground::Void),
+            tiles: Cursor::new(field),
             wanted: Wanted::default(),
             steps: 0,
         }
@@ -153,7 +152,7 @@ impl<'a> Exact<'a> {
             let halt = if front.level >= MAXIMA_LEVELS {
                 course.cross_tiles(maxima, &mut front, &mut self.steps)
             } else {
-                match self.ground(layer, front.cell) {
+                match self.tiles.ground(tile_key(layer, front.cell)) {
                     Ground::Loaded(tile) => course.cross_tile(tile, &mut front, &mut self.steps),
                     Ground::Void => {
                         let exit = course.exit(&front, front.level);
@@ -200,15 +199,6 @@ impl<'a> Exact<'a> {
         front.level = MAXIMA_LEVELS;
         course.pass(front, exit).unwrap_or(Halt::Tile)
     }
-
-    #[inline]
-    fn ground(&mut self, layer: usize, cell: [i32; 2]) -> Ground<'a> {
-        let key = tile_key(layer, cell);
-        if self.tile.0 != key {
-            self.tile = (key, self.field.ground(key));
-        }
-        self.tile.1
-    }
 }
 
 impl<'c> Course<'c> {
@@ -240,8 +230,9 @@ impl<'c> Course<'c> {
             taken += 1;
             let exit = self.exit(&front, front.level);
             if front.level > 0 {
-                let [bi, bj] =
-                    front.cell.map(|index| (index as usize & (TILE_CELLS - 1)) >> front.level);
+                let block =
+                    |axis: usize| (front.cell[axis] as usize & (TILE_CELLS - 1)) >> front.level;
+                let (bi, bj) = (block(0), block(1));
                 if !self.clears(&front, &exit, tile.block_max(front.level, bi, bj)) {
                     front.level -= 1;
                     continue;

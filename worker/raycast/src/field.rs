@@ -136,6 +136,29 @@ impl<'a> Field<'a> {
     }
 }
 
+/// Looks tiles of level 0 up and remembers the last one.
+pub(crate) struct Cursor<'a> {
+    field: Field<'a>,
+    last: (TileKey, Ground<'a>),
+}
+
+impl<'a> Cursor<'a> {
+    pub(crate) fn new(field: Field<'a>) -> Self {
+        let nowhere = TileKey { layer: u16::MAX, level: 0, tx: 0, ty: 0 };
+        Cursor { field, last: (nowhere, Ground::Void) }
+    }
+
+    /// The tile with a key.
+    #[inline]
+    pub(crate) fn ground(&mut self, key: TileKey) -> Ground<'a> {
+        if self.last.0 != key {
+            self.last = (key, self.field.ground(key));
+            self.field.resident.touch(key);
+        }
+        self.last.1
+    }
+}
+
 /// The tile of level 0 that holds a cell.
 #[inline]
 pub(crate) fn tile_key(layer: usize, cell: [i32; 2]) -> TileKey {
@@ -150,7 +173,8 @@ pub(crate) fn tile_key(layer: usize, cell: [i32; 2]) -> TileKey {
 /// The corners of a cell, if it has a surface.
 #[inline(always)]
 pub(crate) fn corners_in(tile: &HeightTile, cell: [i32; 2]) -> Option<Corners> {
-    let [i, j] = cell.map(|index| index as usize & (TILE_CELLS - 1));
+    let within = |axis: usize| cell[axis] as usize & (TILE_CELLS - 1);
+    let (i, j) = (within(0), within(1));
     Corners::new(tile.corners(i, j))
 }
 

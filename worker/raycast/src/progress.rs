@@ -124,7 +124,7 @@ impl Progress {
 }
 
 /// The parts of a region in squares of the frame.
-fn squares(region: Region) -> impl Iterator<Item = Region> {
+pub(crate) fn squares(region: Region) -> impl Iterator<Item = Region> {
     let cuts = |start: u32, length: u32| {
         let end = start.saturating_add(length);
         (start / WIDEST_PX..end.div_ceil(WIDEST_PX)).map(move |block| {
@@ -261,7 +261,7 @@ fn scatter(x: u32, y: u32, sample: u32) -> [f64; 2] {
 }
 
 /// The ray through a point of the picture, and its parameter at a depth.
-fn path(camera: &Camera, ground: Ground, place: [f64; 2], depth: f64) -> (Path, f64) {
+pub(crate) fn path(camera: &Camera, ground: Ground, place: [f64; 2], depth: f64) -> (Path, f64) {
     let ray = camera.ray(place[0], place[1]);
     let length = ray.length();
     (Path::new(ground, camera.position, ray / length), depth * (length * (1.0 - ROUNDING)))

@@ -12,6 +12,7 @@ mod air;
 mod footprint;
 mod photo;
 mod slope;
+mod stack;
 mod tint;
 
 use crate::field::{Contact, Field, Wanted};
@@ -20,8 +21,11 @@ use air::Air;
 use footprint::Footprint;
 use glam::DVec3;
 use photo::Photos;
+use stack::Stack;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::shading::{LinearRgb, Shading, Sun};
+use terrafarm_terrain::resident::Resident;
+use terrafarm_terrain::tile::HeightTile;
 
 /// Sine of the sun's elevation below which flat ground grows dark: 2.9 degrees.
 const LOW_SUN_SINE: f64 = 0.05;
@@ -30,11 +34,12 @@ const MAX_LIGHT: f64 = 2.0;
 
 /// Shades contacts of one view.
 pub(crate) struct Shader<'a> {
-    field: Field<'a>,
     camera: &'a Camera,
     shading: &'a Shading,
     air: Air<'a>,
     photos: Photos<'a>,
+    /// By number of the layer.
+    heights: Vec<Stack<'a, HeightTile>>,
     /// 1 / effective radius of the Earth, per metre.
     curvature: f64,
     /// Width of a sample in the picture, as a tangent.
@@ -51,11 +56,13 @@ impl<'a> Shader<'a> {
         samples_per_side: u32,
     ) -> Self {
         Shader {
-            field,
             camera,
             shading,
             air: Air::new(shading, field.pyramid.lowest(), camera.position.z),
             photos: Photos::new(field),
+            heights: (0..field.index().layers.len())
+                .map(|number| Stack::new(field, number, Resident::height))
+                .collect(),
             curvature: Ground::new(shading.earth).curvature(),
             sample_tangent: 1.0 / (camera.focal_px() * f64::from(samples_per_side)),
             wanted: Wanted::default(),
@@ -80,7 +87,8 @@ impl<'a> Shader<'a> {
         let wanted_before = self.wanted.count;
         let depth = distance_m * view.dot(self.camera.forward);
         let size_m = depth * self.sample_tangent;
-        let slopes = slope::slopes(&self.field, contact, place, size_m, &mut self.wanted);
+        let heights = &mut self.heights[contact.layer];
+        let slopes = slope::slopes(heights, contact, place, size_m, &mut self.wanted);
         let sides = [self.camera.right * size_m, self.camera.up * size_m];
         // Over a round Earth the ray comes in flatter than it set out.
         let turn = (view.x * view.x + view.y * view.y) * contact.u * self.curvature;
@@ -96,7 +104,8 @@ impl<'a> Shader<'a> {
         };
         let light = self.shading.sun.map_or(1.0, |sun| light(&sun, slopes));
         let uncovered = 1.0 - photo[3];
-        let color = [0, 1, 2].map(|c| (photo[c] + uncovered * bare[c]) * light);
+        let lit = |c: usize| (photo[c] + uncovered * bare[c]) * light;
+        let color = [lit(0), lit(1), lit(2)];
         Some(self.air.veil(color, view, distance_m, contact.z))
     }
 }

@@ -37,7 +37,7 @@ fn decode(value: f64) -> f64 {
 /// The bytes of a colour; what is too bright or too dark is cut off.
 pub(crate) fn encode(color: LinearRgb) -> [u8; 3] {
     let table = &*TABLE;
-    color.map(|light| {
+    let byte = |light: f32| {
         let light = if light > 0.0 { light.min(1.0) } else { 0.0 };
         let entry = (light.sqrt() * GUESSES as f32) as usize;
         let mut byte = table.guesses[entry.min(GUESSES)];
@@ -48,7 +48,8 @@ pub(crate) fn encode(color: LinearRgb) -> [u8; 3] {
             byte += 1;
         }
         byte
-    })
+    };
+    [byte(color[0]), byte(color[1]), byte(color[2])]
 }
 
 #[cfg(test)]

@@ -58,7 +58,8 @@ impl<'s> Air<'s> {
         };
         let clear = libm::exp(-(self.extinction * distance_m * mean).min(700.0)) as f32;
         let glow = self.glow(view);
-        [0, 1, 2].map(|c| ground[c] * clear + (haze.color[c] + glow[c]) * (1.0 - clear))
+        let veiled = |c: usize| ground[c] * clear + (haze.color[c] + glow[c]) * (1.0 - clear);
+        [veiled(0), veiled(1), veiled(2)]
     }
 
     /// The sky in a direction. Below the horizon it is what the horizon is.

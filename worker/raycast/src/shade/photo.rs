@@ -5,32 +5,30 @@
 //! where footprints are long and narrow, nor blurs across.
 
 use super::footprint::{Axes, Footprint, level_of};
+use super::stack::Stack;
 use crate::field::{Field, Wanted};
-use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TileKey};
-use terrafarm_terrain::resident::Lookup;
+use terrafarm_terrain::layout::LayerKind;
+use terrafarm_terrain::resident::Resident;
 use terrafarm_terrain::tile::PhotoTile;
 
 /// The most samples along a footprint; longer ones take a coarser level.
 const MAX_SAMPLES: f64 = 16.0;
-/// Size of the footprint for which a level is used, in its texels.
-const TEXELS_PER_FOOTPRINT: f64 = 1.0;
 /// Coverage from which on a photo hides what lies below it.
 const OPAQUE: f32 = 0.999;
 
-/// Reads photos, and remembers the tiles that it used last.
+/// Reads the photos of a store.
 pub(crate) struct Photos<'a> {
-    field: Field<'a>,
     /// Topmost first.
-    layers: Vec<(usize, &'a Layer)>,
-    /// Last tile of even and of odd levels.
-    tiles: [Option<(TileKey, Option<&'a PhotoTile>)>; 2],
+    stacks: Vec<Stack<'a, PhotoTile>>,
 }
 
 impl<'a> Photos<'a> {
     pub(crate) fn new(field: Field<'a>) -> Self {
-        let mut layers: Vec<_> = field.index().layers_of(LayerKind::Photo).collect();
-        layers.reverse();
-        Photos { field, layers, tiles: [None; 2] }
+        let layers = field.index().layers_of(LayerKind::Photo);
+        let mut stacks: Vec<_> =
+            layers.map(|(number, _)| Stack::new(field, number, Resident::photo)).collect();
+        stacks.reverse();
+        Photos { stacks }
     }
 
     /// Colour (premultiplied) and coverage at a place of the map. Tiles that are not
@@ -42,16 +40,16 @@ impl<'a> Photos<'a> {
         wanted: &mut Wanted,
     ) -> [f32; 4] {
         let mut sum = [0.0; 4];
-        for at in 0..self.layers.len() {
-            let (number, layer) = self.layers[at];
-            let texel = [0, 1].map(|axis| (place[axis] - layer.origin[axis]) / layer.spacing[axis]);
-            let inside = (0..2)
-                .all(|axis| texel[axis] >= -0.5 && texel[axis] <= layer.posts[axis] as f64 - 0.5);
-            if !inside {
+        for stack in &mut self.stacks {
+            let texel = stack.posts_at(place);
+            let inside = |axis: usize| {
+                texel[axis] >= -0.5 && texel[axis] <= stack.layer.posts[axis] as f64 - 0.5
+            };
+            if !inside(0) || !inside(1) {
                 continue;
             }
-            let axes = footprint.axes(layer.spacing);
-            let below = self.filtered(number, layer, texel, &axes, wanted);
+            let axes = footprint.axes(stack.layer.spacing);
+            let below = filtered(stack, texel, &axes, wanted);
             let uncovered = 1.0 - sum[3];
             for channel in 0..4 {
                 sum[channel] += uncovered * below[channel];
@@ -62,92 +60,80 @@ impl<'a> Photos<'a> {
         }
         sum
     }
+}
 
-    fn filtered(
-        &mut self,
-        number: usize,
-        layer: &Layer,
-        texel: [f64; 2],
-        axes: &Axes,
-        wanted: &mut Wanted,
-    ) -> [f32; 4] {
-        let width = (axes.minor_length.max(axes.major_length / MAX_SAMPLES)).max(1.0);
-        let (level, share) = level_of(width / TEXELS_PER_FOOTPRINT, layer.levels.len() - 1);
-        let samples = (axes.major_length / width).ceil().clamp(1.0, MAX_SAMPLES);
-        let mut sum = [0.0; 4];
-        for sample in 0..samples as u32 {
-            let along = (f64::from(sample) + 0.5) / samples - 0.5;
-            let place = [texel[0] + axes.major.x * along, texel[1] + axes.major.y * along];
-            let fine = self.bilinear(number, layer, level, place, wanted);
-            if share > 0.0 {
-                let coarse = self.bilinear(number, layer, level + 1, place, wanted);
-                for channel in 0..4 {
-                    sum[channel] += fine[channel] + (coarse[channel] - fine[channel]) * share;
-                }
-            } else {
-                for channel in 0..4 {
-                    sum[channel] += fine[channel];
-                }
-            }
-        }
-        let scale = 1.0 / (65535.0 * samples as f32);
-        sum.map(|channel| channel * scale)
+/// The mean over a footprint, blended from the two levels whose texels are at most as
+/// wide as it, and at least.
+fn filtered(
+    stack: &mut Stack<PhotoTile>,
+    texel: [f64; 2],
+    axes: &Axes,
+    wanted: &mut Wanted,
+) -> [f32; 4] {
+    let width = axes.minor_length.max(axes.major_length * (1.0 / MAX_SAMPLES)).max(1.0);
+    let (level, share) = level_of(width, stack.top());
+    let samples = (axes.major_length / width).clamp(1.0, MAX_SAMPLES);
+    let fine = mean(stack, level, samples, texel, axes, wanted);
+    if share == 0.0 {
+        return fine;
     }
+    // Texels twice as wide need half as many samples.
+    let coarse = mean(stack, level + 1, (0.5 * samples).max(1.0), texel, axes, wanted);
+    let mut sum = fine;
+    for channel in 0..4 {
+        sum[channel] += (coarse[channel] - fine[channel]) * share;
+    }
+    sum
+}
 
-    /// Colour at a place of level 0, from a level of the pyramid, 65535 = 1.
-    #[inline]
-    fn bilinear(
-        &mut self,
-        number: usize,
-        layer: &Layer,
-        level: usize,
-        place: [f64; 2],
-        wanted: &mut Wanted,
-    ) -> [f32; 4] {
-        let posts = layer.level_posts(level);
-        let shrink = 1.0 / (1u64 << level) as f64;
-        let [x, y] = [0, 1].map(|axis| (place[axis] * shrink).clamp(0.0, (posts[axis] - 1) as f64));
-        let [tx, ty] = [(x, 0), (y, 1)].map(|(value, axis)| {
-            (value as u32 / TILE_CELLS as u32).min(layer.levels[level].tiles[axis] - 1)
-        });
-        let key = TileKey { layer: number as u16, level: level as u16, tx, ty };
-        let Some(tile) = self.tile(key, wanted) else { return [0.0; 4] };
-        let local_x = x - f64::from(tx * TILE_CELLS as u32);
-        let local_y = y - f64::from(ty * TILE_CELLS as u32);
-        let (i, j) = (local_x as isize, local_y as isize);
-        let (fx, fy) = ((local_x - i as f64) as f32, (local_y - j as f64) as f32);
-        let [sw, se, nw, ne] = [(0, 0), (1, 0), (0, 1), (1, 1)]
-            .map(|(di, dj)| tile.texel(i + di, j + dj).map(f32::from));
-        let mut color = [0.0; 4];
+/// The mean of samples of one level along the long axis of a footprint; their number is
+/// rounded up.
+#[inline]
+fn mean(
+    stack: &mut Stack<PhotoTile>,
+    level: usize,
+    samples: f64,
+    texel: [f64; 2],
+    axes: &Axes,
+    wanted: &mut Wanted,
+) -> [f32; 4] {
+    let below = samples as u32;
+    let count = below + u32::from(samples > f64::from(below));
+    let share = 1.0 / f64::from(count);
+    let step = [axes.major.x * share, axes.major.y * share];
+    let first = 0.5 - 0.5 * f64::from(count);
+    let mut sum = [0.0; 4];
+    for sample in 0..count {
+        let along = first + f64::from(sample);
+        let place = [texel[0] + step[0] * along, texel[1] + step[1] * along];
+        let color = bilinear(stack, level, place, wanted);
         for channel in 0..4 {
-            let south = sw[channel] + (se[channel] - sw[channel]) * fx;
-            let north = nw[channel] + (ne[channel] - nw[channel]) * fx;
-            color[channel] = south + (north - south) * fy;
+            sum[channel] += color[channel];
         }
-        color
     }
+    let scale = share as f32 * (1.0 / 65535.0);
+    [sum[0] * scale, sum[1] * scale, sum[2] * scale, sum[3] * scale]
+}
 
-    #[inline]
-    fn tile(&mut self, key: TileKey, wanted: &mut Wanted) -> Option<&'a PhotoTile> {
-        let slot = &mut self.tiles[usize::from(key.level & 1)];
-        if let Some((last, tile)) = slot
-            && *last == key
-        {
-            return *tile;
-        }
-        match self.field.resident.photo(key) {
-            Lookup::Found(tile) => {
-                *slot = Some((key, Some(tile)));
-                Some(tile)
-            }
-            Lookup::Empty => {
-                *slot = Some((key, None));
-                None
-            }
-            Lookup::Absent => {
-                wanted.add(key);
-                None
-            }
-        }
+/// Colour at a place of level 0, from a level of the pyramid, 65535 = 1.
+#[inline]
+fn bilinear(
+    stack: &mut Stack<PhotoTile>,
+    level: usize,
+    place: [f64; 2],
+    wanted: &mut Wanted,
+) -> [f32; 4] {
+    let Some(spot) = stack.spot(level, place, wanted) else { return [0.0; 4] };
+    let ([i, j], [x, y]) = (spot.cell, spot.share);
+    let (sw, se) = (spot.tile.texel(i, j), spot.tile.texel(i + 1, j));
+    let (nw, ne) = (spot.tile.texel(i, j + 1), spot.tile.texel(i + 1, j + 1));
+    let mut color = [0.0; 4];
+    for channel in 0..4 {
+        let from = f32::from(sw[channel]);
+        let south = from + (f32::from(se[channel]) - from) * x;
+        let from = f32::from(nw[channel]);
+        let north = from + (f32::from(ne[channel]) - from) * x;
+        color[channel] = south + (north - south) * y;
     }
+    color
 }
