@@ -46,9 +46,8 @@ fn posts_on_the_stores_grid_are_taken_bit_for_bit() {
 
 #[test]
 fn a_spacing_that_is_asked_for_is_used_and_its_own_is_no_resampling() {
-    let raster = || {
-        MemoryRaster::heights(UTM, [300_015.5, 4_100_000.25], [30.0, 30.0], [60, 30], noise)
-    };
+    let raster =
+        || MemoryRaster::heights(UTM, [300_015.5, 4_100_000.25], [30.0, 30.0], [60, 30], noise);
     let with = |spacing| ImportSettings { spacing_m: Some(spacing), ..plain() };
     let finer = import(sources(vec![raster()]), &with(12.5));
     assert_eq!(finer.layer(0).spacing, [12.5; 2]);

@@ -59,7 +59,12 @@ fn the_number_of_threads_changes_nothing() {
 
 #[test]
 fn another_seed_is_another_terrain() {
-    let differ = make(spec(65, 1)).all_heights().iter().zip(make(spec(65, 2)).all_heights()).filter(|(a, b)| **a != *b).count();
+    let differ = make(spec(65, 1))
+        .all_heights()
+        .iter()
+        .zip(make(spec(65, 2)).all_heights())
+        .filter(|(a, b)| **a != *b)
+        .count();
     assert!(differ > 65 * 60, "{differ}");
 }
 
@@ -68,7 +73,9 @@ fn odd_sizes_are_made_and_all_numbers_are_finite() {
     for posts in [2, 3, 257, 300] {
         let heights = make(spec(posts, 9)).all_heights();
         assert_eq!(heights.len(), (posts * posts) as usize);
-        assert!(heights.iter().all(|height| height.is_finite() && (-500.0..6000.0).contains(height)));
+        assert!(
+            heights.iter().all(|height| height.is_finite() && (-500.0..6000.0).contains(height))
+        );
     }
 }
 
@@ -101,7 +108,8 @@ fn slopes() -> Vec<f32> {
 #[test]
 fn there_are_floors_slopes_and_few_walls() {
     let slopes = slopes();
-    let share = |below: f32| slopes.partition_point(|slope| *slope < below) as f64 / slopes.len() as f64;
+    let share =
+        |below: f32| slopes.partition_point(|slope| *slope < below) as f64 / slopes.len() as f64;
     let (flat, steep) = (share(0.1), 1.0 - share(1.2));
     let median = slopes[slopes.len() / 2];
     assert!((0.02..0.5).contains(&flat), "{flat} of the ground is nearly level");
@@ -158,9 +166,8 @@ fn lakes_are_flat_and_blue() {
     let mut colors = vec![[0; 4]; SIDE * SIDE];
     synth.colors(0, 0, SIDE, SIDE, &mut colors).unwrap();
     let lake = heights.iter().zip(&colors).filter(|(height, _)| **height == best.1);
-    let (blue, all) = lake.fold((0, 0), |(blue, all), (_, color)| {
-        (blue + usize::from(color[2] > color[0]), all + 1)
-    });
+    let (blue, all) = lake
+        .fold((0, 0), |(blue, all), (_, color)| (blue + usize::from(color[2] > color[0]), all + 1));
     assert!(blue * 10 > all * 8, "{blue} of {all} posts are blue");
 }
 
