@@ -127,7 +127,11 @@ fn print_import(args: &args::Import, done: &ImportSummary) -> anyhow::Result<()>
 fn info(store: &Path, json: bool) -> anyhow::Result<()> {
     let reader = StoreReader::open(store)?;
     let info: StoreInfo = summary(&reader);
-    if json { print_json(&info) } else { Ok(print_info(&info)) }
+    if json {
+        return print_json(&info);
+    }
+    print_info(&info);
+    Ok(())
 }
 
 fn print_info(info: &StoreInfo) {
@@ -283,6 +287,7 @@ fn parse_color(text: &str) -> anyhow::Result<[u8; 3]> {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
 
     #[test]

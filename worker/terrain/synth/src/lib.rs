@@ -1,10 +1,10 @@
 //! Procedural terrain: eroded mountains with a plausible aerial photo, from a seed.
 //!
 //! [`synthesize`] shapes a macro map of at most [`MACRO_SIDE`] cells a side: uplift and
-//! rivers make valleys ([`erode`]), gravel, fans and dams make floors and lakes
-//! ([`valley`]). The [`Synth`] it returns answers for any window of heights or colours:
+//! rivers make valleys (`erode`), gravel, fans and dams make floors and lakes
+//! (`valley`). The [`Synth`] it returns answers for any window of heights or colours:
 //! the macro map enlarged smoothly, with ribs, gullies and roughness added as a pure
-//! function of place ([`surface`], [`photo`]). A terrain of 32 769 posts a side is never
+//! function of place (`surface`, `photo`). A terrain of 32 769 posts a side is never
 //! held in memory.
 //!
 //! Same [`SynthSpec`], same bytes: on every platform, with any number of threads, by any
