@@ -14,7 +14,8 @@ impl ProjString {
     /// several words with one name the first counts, as in PROJ.
     pub(crate) fn parse(text: &str) -> Self {
         let mut parsed = ProjString::default();
-        for word in text.split_ascii_whitespace() {
+        let is_gap = |c: char| c.is_whitespace() || c == '\0' || c == '\u{feff}';
+        for word in text.split(is_gap).filter(|word| !word.is_empty()) {
             let word = word.strip_prefix('+').unwrap_or(word);
             let (name, value) = match word.split_once('=') {
                 Some((name, value)) => (name, Some(value.trim_matches('"').to_owned())),
@@ -98,6 +99,12 @@ mod tests {
         let parsed = ProjString::parse("+proj=tmerc +lon_0=9 +Lon_0=10 +south +south=1 +south");
         assert_eq!(parsed.to_string(), "+proj=tmerc +lon_0=9 +south");
         assert_eq!(ProjString::parse(&parsed.to_string()), parsed);
+    }
+
+    #[test]
+    fn nothing_that_is_trimmed_from_a_text_stays_in_a_value() {
+        let parsed = ProjString::parse("+proj=utm\u{b}+zone=12\0\u{c}\u{feff}+south\u{a0}");
+        assert_eq!(parsed.to_string(), "+proj=utm +zone=12 +south");
     }
 
     #[test]

@@ -31,6 +31,11 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
     }
     let bytes = source.whole(MAX_WHOLE_FILE_BYTES)?;
     let length = bytes.len() as u64;
+    if !is_sampling_usual(&bytes) {
+        let what =
+            format!("the JPEG samples its components in an unusual way; {}", conversion_hint(path));
+        return Err(RasterError::unsupported(path, what));
+    }
     let settings = DecoderOptions::new_safe()
         .set_strict_mode(true)
         .set_max_width(1 << 16)
@@ -77,4 +82,36 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
         warnings: placement.warnings,
     };
     Ok(Box::new(WholePhoto { info, channels: 3, bytes: pixels, collar: options.collar }))
+}
+
+/// Whether in every frame header before the first scan the first component is the one
+/// with the most samples, and the others have as many or an even part of them. All other
+/// ways are allowed by the format and used by nobody; the decoder panics on some.
+fn is_sampling_usual(bytes: &[u8]) -> bool {
+    let mut rest = bytes.get(2..).unwrap_or_default();
+    while let Some(at) = rest.windows(2).position(|pair| pair[0] == 0xff && pair[1] != 0xff) {
+        let marker = rest[at + 1];
+        rest = &rest[at + 2..];
+        match marker {
+            0xd9 | 0xda => return true,
+            0x00 | 0x01 | 0xd0..=0xd8 => continue,
+            _ => {}
+        }
+        let Some(length) = rest.first_chunk().map(|length| u16::from_be_bytes(*length)) else {
+            return true;
+        };
+        let (segment, after) = rest.split_at(rest.len().min(usize::from(length).max(2)));
+        let is_frame = matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc);
+        let components = segment.get(8..).unwrap_or_default().chunks_exact(3);
+        let mut sampling = components.map(|component| [component[1] >> 4, component[1] & 15]);
+        if let (true, Some(first)) = (is_frame, sampling.next()) {
+            let divides = |part: u8, whole: u8| part > 0 && whole % part == 0;
+            let is_usual = |other: [u8; 2]| (0..2).all(|axis| divides(other[axis], first[axis]));
+            if !is_usual(first) || !sampling.all(is_usual) {
+                return false;
+            }
+        }
+        rest = after;
+    }
+    true
 }

@@ -141,6 +141,15 @@ fn a_jpeg_that_declares_more_pixels_than_its_bytes_can_hold_is_refused() {
 }
 
 #[test]
+fn a_jpeg_whose_first_component_has_fewer_samples_than_another_is_refused() {
+    let mut bytes = tiny_jpeg(3, 0x11);
+    let frame = bytes.windows(4).position(|bytes| bytes == [0, 16, 0, 16]).unwrap();
+    bytes[frame + 9] = 0x24;
+    let error = open_source(memory("a.jpg", bytes), &photo_wanted()).err().unwrap();
+    assert!(error.to_string().contains("unusual"), "{error}");
+}
+
+#[test]
 fn directories_in_a_circle_are_walked_once() {
     let mut bytes = tiny_tiff(TILED);
     let first = bytes[4..8].to_vec();
