@@ -18,11 +18,13 @@ pub struct Grid {
 impl Grid {
     /// What `tests/record-viewsheds` has GRASS look at.
     pub fn procedural() -> Self {
-        let wave = |n: i64, period: i64| (n.rem_euclid(2 * period) - period).abs();
+        let hill = |n: i64, period: i64| {
+            let n = n.rem_euclid(2 * period) - period;
+            n * n / period
+        };
         let height = |i: i64, j: i64| {
-            6 * wave(3 * i + j + 20, 150)
-                + 4 * wave(5 * j - 3 * i + 400, 110)
-                + 3 * wave(11 * i + 7 * j, 60)
+            7 * hill(3 * i + j + 20, 150) + 4 * hill(5 * j - 3 * i + 400, 190)
+                - 2 * hill(7 * i - 4 * j + 700, 140)
                 + (7 * i * i + 13 * j * j + 5 * i * j) % 7
         };
         let posts = (0..120).flat_map(|j| (0..120).map(move |i| (i, j)));
