@@ -25,3 +25,7 @@ mod commands;
 /// Every command in the documents is one that works.
 #[path = "whole/documents.rs"]
 mod documents;
+
+/// What is visible, against other programs.
+#[path = "whole/oracles.rs"]
+mod oracles;

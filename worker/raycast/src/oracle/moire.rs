@@ -16,7 +16,7 @@ use terrafarm_common::shading::Earth;
 
 /// Measured: 31.9 to 38.9 dB, 12.8 to 16.1 pointwise, 17.8 to 22.0 blurred.
 const LEAST_DB: f64 = 30.0;
-const SIZE: (u32, u32) = (160, 90);
+const SIZE: (u32, u32) = (112, 63);
 const STEP_M: f64 = 10.0;
 const POSTS: u64 = 1500;
 /// Posts along a side of a field of the checkerboard.

@@ -17,13 +17,20 @@ fn ray(land: &Land, dice: &mut Dice) -> (DVec3, DVec3) {
     let deep = if dice.below(8) == 0 { low } else { 0.5 * (low + high) };
     let start = DVec3::new(along(land, dice, 0), along(land, dice, 1), dice.between(deep, high));
     let whole = |dice: &mut Dice| dice.whole(-3, 3) as f64;
-    let mut direction = match dice.below(10) {
+    let mut direction = match dice.below(11) {
         0 => DVec3::new(whole(dice), whole(dice), whole(dice)),
         1 => DVec3::new(whole(dice), 0.0, -dice.unit()),
         2 => DVec3::new(0.0, whole(dice), -dice.unit()),
         3 => DVec3::NEG_Z,
         4 => DVec3::new(dice.unit() - 0.5, dice.unit() - 0.5, 0.02 * (dice.unit() - 0.7)),
-        5 | 6 => {
+        // Nearly along a line of the grid, and nearly straight down.
+        5 => {
+            let little = [1e-320, 1e-200, 1e-15, 1e-9][dice.below(4) as usize];
+            let tilt = DVec3::new(whole(dice), whole(dice), 0.0) * little;
+            tilt + [DVec3::X, DVec3::NEG_Y, DVec3::ZERO][dice.below(3) as usize]
+                + DVec3::NEG_Z * dice.unit()
+        }
+        6 | 7 => {
             let (x, y) = (along(land, dice, 0), along(land, dice, 1));
             let side = if dice.below(2) == 0 { NEAR_M } else { -NEAR_M };
             let z = land.height(x, y, high).unwrap_or(low) + side;

@@ -93,3 +93,50 @@ fn every_downward_ray_from_above_hits_at_the_surface() {
     }
     println!("{rays} rays, all hit; farthest from the surface: {worst:.1e} m");
 }
+
+/// Three layers without voids, the later ones over parts of the earlier.
+fn layers() -> Land {
+    let hills = |i: u64, j: u64| mountains(i, j, 16, 20.0, 3);
+    let plans = vec![
+        Plan::heights([0.0; 2], [3.0; 2], [40, 40], hills),
+        Plan::heights([10.5, 9.0], [1.0; 2], [50, 40], |i, j| hills(i / 3, j / 3) + 3.0),
+        Plan::heights([40.25, 30.5], [0.5, 0.25], [99, 130], |i, j| hills(i / 6, j / 12) - 4.0),
+    ];
+    Land::new("layers", plans)
+}
+
+#[test]
+fn no_ray_slips_between_layers() {
+    let land = layers();
+    let (lowest, highest) = (land.pyramid.lowest(), land.pyramid.highest());
+    let layers = &land.resident.index().layers;
+    let on_border = |place: DVec3| {
+        layers.iter().any(|layer| {
+            let far = layer.far_corner();
+            (0..2).any(|axis| {
+                let near = |border: f64| (place[axis] - border).abs() < 1e-9;
+                near(layer.origin[axis]) || near(far[axis])
+            })
+        })
+    };
+    let mut dice = Dice::new(91_000_000_000);
+    let mut walls = 0;
+    for _ in 0..count(RAYS) {
+        // Half of the coordinates lie on lines of one layer or another.
+        let place = |dice: &mut Dice| {
+            let at = dice.between(0.0, 117.0);
+            if dice.below(2) == 0 { (4.0 * at).round() / 4.0 } else { at }
+        };
+        let start = DVec3::new(place(&mut dice), place(&mut dice), highest + dice.unit());
+        let end = DVec3::new(place(&mut dice), place(&mut dice), lowest - dice.unit());
+        let hit = land.cast(Method::Exact, None, start, end - start);
+        let hit = hit.unwrap_or_else(|| panic!("{start} to {end}"));
+        let deep = hit.height - hit.position.z;
+        // Only a wall is met below the surface.
+        assert!(deep > -1e-9, "{start} to {end}: {hit:?}");
+        assert!(deep < 1e-9 || on_border(hit.position), "{start} to {end}: {hit:?}");
+        walls += u64::from(deep >= 1e-9);
+    }
+    println!("{} rays, all hit, {walls} of them a wall", count(RAYS));
+    assert!(walls > count(RAYS) / 1000);
+}
