@@ -2,7 +2,7 @@
 //!
 //! [`greet`] and [`accept`] do the handshake and give a [`Connection`], which splits
 //! into a [`Reader`] and a [`Writer`]. The rest of the program sees whole messages.
-//! [`outbox`] keeps small messages from waiting behind long ones.
+//! [`outbox()`] keeps small messages from waiting behind long ones.
 //!
 //! A stream that ends between two messages is a clean end, `Ok(None)`; one that ends
 //! inside a message is an error, and the difference is kept.
