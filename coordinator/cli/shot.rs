@@ -11,7 +11,7 @@ use indicatif::ProgressBar;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex};
 use terrafarm_common::image::Rgb8;
@@ -23,12 +23,14 @@ use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
 use terrafarm_film::OrderedFrames;
 use terrafarm_terrain::store::{StoreReader, hash_of};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 /// Frames under way at once unless the user says otherwise: one being written, one whose
 /// last jobs run, one that has begun.
 pub const FRAMES_IN_FLIGHT: u32 = 3;
+/// How long nothing may come back before the user is told why that may be.
+const PATIENCE: Duration = Duration::from_secs(8);
 /// Shown instead of a frame that could not be rendered: nobody takes it for terrain.
 const FAILED_FRAME_RGB: [u8; 3] = [255, 0, 255];
 
@@ -228,6 +230,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let rendered = client::render(&address, submission, updates, taken_out, stop).await;
     interrupt.abort();
     give_up.abort();
+    hint.abort();
     if deserted.is_cancelled() && rendered.is_err() {
         bail!("every local worker ended and would not start again; their messages stand above");
     }
@@ -273,12 +276,26 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     Ok(Report { finished, manifest_path, manifest, seconds: started.elapsed().as_secs_f64() })
 }
 
+/// A farm without workers looks like a slow one: tells the user which it is.
+async fn say_if_nobody_works(begun: oneshot::Receiver<()>, bar: ProgressBar, address: String) {
+    if tokio::time::timeout(PATIENCE, begun).await.is_err() {
+        bar.suspend(|| {
+            eprintln!(
+                "terrafarm: no worker has finished a job yet; start some with \
+                 \"terrafarm worker --coordinator {address}\", or wait"
+            );
+        });
+    }
+}
+
 /// Puts frames in order and into the sink.
 struct Desk {
     spec: Spec,
     first: FrameIndex,
     poster: Option<(FrameIndex, PathBuf)>,
     bar: ProgressBar,
+    /// Told once, when anything comes back.
+    first_sign: Option<oneshot::Sender<()>>,
 }
 
 #[derive(Default)]
@@ -290,7 +307,7 @@ struct Written {
 
 impl Desk {
     fn write(
-        self,
+        mut self,
         mut sink: Box<dyn FrameSink>,
         mut inbox: mpsc::Receiver<Update>,
         taken: &mpsc::Sender<FrameIndex>,
@@ -298,6 +315,9 @@ impl Desk {
         let mut order = OrderedFrames::new(self.spec.frames as usize);
         let mut written = Written::default();
         while let Some(update) = inbox.blocking_recv() {
+            if let Some(first_sign) = self.first_sign.take() {
+                let _ = first_sign.send(());
+            }
             match update {
                 Update::Progress(progress) => {
                     self.bar.set_message(format!("on {} workers", progress.workers));

@@ -15,6 +15,8 @@ use terrafarm_wire::message::{
 
 /// Most frames of all shots together: their cameras take about 0.5 GB.
 const CAMERAS_MAX: u64 = 4 << 20;
+/// Memory for frames that are begun and not yet taken, all shots together, bytes.
+const FILM_BYTES_MAX: u64 = 8 << 30;
 /// Most shots of one client at once.
 const SHOTS_PER_CLIENT: usize = 64;
 
@@ -73,6 +75,12 @@ pub struct Shots {
     shots: BTreeMap<ShotId, Shot>,
     last: u64,
     cameras: u64,
+    film_bytes: u64,
+}
+
+/// Memory that the frames of a shot may take at the coordinator, bytes.
+fn film_bytes(submit: &Submit) -> u64 {
+    u64::from(submit.width) * u64::from(submit.height) * 3 * u64::from(submit.frames_in_flight)
 }
 
 impl Shots {
@@ -115,6 +123,19 @@ impl Shots {
                 self.cameras
             ));
         }
+        let film = film_bytes(&submit);
+        if self.film_bytes.saturating_add(film) > FILM_BYTES_MAX {
+            return Err(format!(
+                "{} frames of {} x {} pixels in flight need {} MiB of the coordinator's memory, and {} \
+                 MiB are left; use fewer --frames-in-flight or smaller pictures",
+                submit.frames_in_flight,
+                submit.width,
+                submit.height,
+                film >> 20,
+                (FILM_BYTES_MAX - self.film_bytes) >> 20
+            ));
+        }
+        self.film_bytes += film;
         self.cameras += u64::from(submit.frames);
         self.last += 1;
         let shot = Shot {
@@ -294,6 +315,7 @@ impl Shots {
     pub fn remove(&mut self, shot: ShotId) -> Option<Shot> {
         let state = self.shots.remove(&shot)?;
         self.cameras -= u64::from(state.submit.frames);
+        self.film_bytes -= film_bytes(&state.submit);
         Some(state)
     }
 }

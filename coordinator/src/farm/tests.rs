@@ -51,14 +51,7 @@ impl Bench {
             number: 1,
             name: "test".into(),
             index: BlobHash([1; 32]),
-            shading: Shading {
-                sun: None,
-                haze: None,
-                sky: Sky::default(),
-                earth: None,
-                below_ground: [0.0; 3],
-                bare_ground: None,
-            },
+            shading: shading(),
             quality: Quality::default(),
             width: SIZE.0,
             height: SIZE.1,
@@ -70,6 +63,17 @@ impl Bench {
         let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
         let cameras = vec![camera; frames as usize];
         self.say(Peer::Client(CLIENT), Cameras { number: 1, first: 0, cameras })
+    }
+}
+
+fn shading() -> Shading {
+    Shading {
+        sun: None,
+        haze: None,
+        sky: Sky::default(),
+        earth: None,
+        below_ground: [0.0; 3],
+        bare_ground: None,
     }
 }
 
@@ -244,6 +248,27 @@ fn a_peer_that_sends_what_is_not_its_to_send_is_closed() {
     assert!(out.iter().any(|o| matches!(o, Out::Close(peer, _) if *peer == worker(1))), "{out:?}");
     let out = bench.submit(1);
     assert!(grants(&out).is_empty(), "it gets no work");
+}
+
+#[test]
+fn a_shot_that_needs_too_much_memory_is_rejected_with_advice() {
+    let mut bench = Bench::new();
+    bench.submit(1);
+    let submit = Submit {
+        number: 2,
+        name: "vast".into(),
+        index: BlobHash([1; 32]),
+        shading: shading(),
+        quality: Quality::default(),
+        width: 16_384,
+        height: 16_384,
+        split: Split::Columns,
+        frames: 1000,
+        frames_in_flight: 1000,
+    };
+    let out = bench.say(Peer::Client(CLIENT), submit);
+    let [Out::Send(_, Message::Rejected(rejected))] = &out[..] else { panic!("{out:?}") };
+    assert!(rejected.reason.contains("--frames-in-flight"), "{}", rejected.reason);
 }
 
 #[test]
