@@ -181,7 +181,7 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
         Out::SendFrame(client, head, picture) => {
             let peer = Peer::Client(client);
             let line = lines.get(&peer)?;
-            let outbox = line.outbox.clone();
+            let (outbox, hang_up) = (line.outbox.clone(), line.hang_up.clone());
             let loopback = line.loopback;
             // At most as many at once as frames may be in flight.
             tokio::task::spawn_blocking(move || {
@@ -189,7 +189,13 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
                 let packed =
                     if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };
                 match packed {
-                    Ok(pixels) => drop(outbox.try_send(head.with(pixels))),
+                    Ok(pixels) => {
+                        // A frame that cannot be queued is one that never comes: better
+                        // no connection than a client that waits for ever.
+                        if outbox.try_send(head.with(pixels)).is_err() {
+                            hang_up.cancel();
+                        }
+                    }
                     Err(why) => tracing::error!("cannot pack a frame: {why}"),
                 }
             });
