@@ -105,7 +105,7 @@ fn is_sampling_usual(bytes: &[u8]) -> bool {
         let components = segment.get(8..).unwrap_or_default().chunks_exact(3);
         let mut sampling = components.map(|component| [component[1] >> 4, component[1] & 15]);
         if let (true, Some(first)) = (is_frame, sampling.next()) {
-            let divides = |part: u8, whole: u8| part > 0 && whole % part == 0;
+            let divides = |part: u8, whole: u8| part > 0 && whole.is_multiple_of(part);
             let is_usual = |other: [u8; 2]| (0..2).all(|axis| divides(other[axis], first[axis]));
             if !is_usual(first) || !sampling.all(is_usual) {
                 return false;
