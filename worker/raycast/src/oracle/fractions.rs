@@ -196,7 +196,7 @@ impl Layer {
     /// The cell over which the ray is at `t`, by the rule of lines for a ray along one.
     fn cell_at(&self, ray: &Ray, t: Fraction) -> Option<[i64; 2]> {
         let mut cell = [0; 2];
-        for axis in 0..2 {
+        for (axis, index) in cell.iter_mut().enumerate() {
             let from = i128::from(ray.start[axis] - self.origin[axis]);
             let over = from * t.under + i128::from(ray.direction[axis]) * t.over;
             let under = t.under * i128::from(self.spacing[axis]);
@@ -204,7 +204,7 @@ impl Layer {
             if over < 0 || over > last * under {
                 return None;
             }
-            cell[axis] = (over.div_euclid(under)).min(last - 1) as i64;
+            *index = (over.div_euclid(under)).min(last - 1) as i64;
         }
         Some(cell)
     }
