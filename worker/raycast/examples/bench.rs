@@ -40,7 +40,7 @@ const SPACING_M: f64 = 10.0;
 const CAMERAS: [(&str, f64, f64, f64); 3] =
     [("low", 0.10, 300.0, -5.0), ("mid", 0.25, 1500.0, -30.0), ("steep", 0.5, 3000.0, -80.0)];
 /// Every so many pixels along x and y one is compared with the reference.
-const CHECKED_PX: usize = 97;
+const CHECKED_PX: u32 = 97;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
@@ -177,9 +177,7 @@ fn check(resident: &Resident, pyramid: &Pyramid, view: &View) -> usize {
     let mut wrong = 0;
     let frame = Region::whole(view.camera.width, view.camera.height);
     let traced = trace(resident, pyramid, view, frame, |x, y, hit| {
-        if !(x as usize + 31).is_multiple_of(CHECKED_PX)
-            || !(y as usize + 17).is_multiple_of(CHECKED_PX)
-        {
+        if !(x + 31).is_multiple_of(CHECKED_PX) || !(y + 17).is_multiple_of(CHECKED_PX) {
             return;
         }
         let (x, y) = (f64::from(x) + 0.5, f64::from(y) + 0.5);

@@ -97,9 +97,8 @@ impl<'a> Beams<'a> {
         let layers = field.index().layers_of(LayerKind::Height).map(|(number, layer)| {
             let scale = layer.spacing.map(|spacing| 1.0 / spacing);
             let cells = cells_of(layer);
-            for axis in 0..2 {
-                let side = f64::from(cells[axis]) * layer.spacing[axis];
-                first_step = first_step.max(side * FIRST_STEP);
+            for (count, spacing) in cells.into_iter().zip(layer.spacing) {
+                first_step = first_step.max(f64::from(count) * spacing * FIRST_STEP);
             }
             let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
             Grid { number, eye, scale, cells }

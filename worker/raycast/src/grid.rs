@@ -51,7 +51,7 @@ impl GridRay {
             enter_u: 0.0,
             exit_u: path.reach_u,
         };
-        for axis in 0..2 {
+        for (axis, &count) in cells.iter().enumerate() {
             let scale = 1.0 / layer.spacing[axis];
             let start = (path.origin[axis] - layer.origin[axis]) * scale;
             let rate = path.direction[axis] * scale;
@@ -59,10 +59,10 @@ impl GridRay {
             ray.rate[axis] = rate;
             ray.inverse[axis] = 1.0 / rate;
             ray.line_start[axis] = start;
-            let last = f64::from(cells[axis]);
+            let last = f64::from(count);
             if ray.inverse[axis].is_finite() {
                 ray.forward[axis] = rate > 0.0;
-                let (first, second) = (ray.line_u(axis, 0), ray.line_u(axis, cells[axis]));
+                let (first, second) = (ray.line_u(axis, 0), ray.line_u(axis, count));
                 ray.enter_u = ray.enter_u.max(first.min(second));
                 ray.exit_u = ray.exit_u.min(first.max(second));
             } else {

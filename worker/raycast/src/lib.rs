@@ -17,7 +17,8 @@
 //! Read in this order: [`path`](self) is the way of a ray over flat or round ground,
 //! `grid` where it crosses the lines of a layer, `cell` where it meets the surface;
 //! `reference` walks from cell to cell, `exact` finds the same contacts by skipping what
-//! lies below the ray, with maxima from [`Pyramid`]; `field` says which layer holds
+//! lies below the ray, with maxima from [`Pyramid`], and `beam` spares it the way that all
+//! rays through a square of pixels clear; `field` says which layer holds
 //! where; `progress` turns a region into rays and `shade` contacts into colours.
 //!
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
