@@ -207,8 +207,15 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let (updates, inbox) = mpsc::channel(2 * in_flight + 8);
     let (taken, taken_out) = mpsc::channel(in_flight + 8);
     let bar = progress::bar("frames", u64::from(spec.frames));
-    let desk =
-        Desk { spec, first: plan.first_frame, poster: plan.poster.clone(), bar: bar.clone() };
+    let (first_sign, begun) = oneshot::channel();
+    let desk = Desk {
+        spec,
+        first: plan.first_frame,
+        poster: plan.poster.clone(),
+        bar: bar.clone(),
+        first_sign: Some(first_sign),
+    };
+    let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), address.clone()));
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
     let submission = Submission {
         name: plan.name.clone(),
