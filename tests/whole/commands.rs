@@ -282,3 +282,45 @@ fn help_and_version_end_well() {
     }
     run(terrafarm().arg("fly-me-to-the-moon"), 2);
 }
+
+/// The import command that stands at the top of an example scene, without its output.
+fn import_command(scene: &str) -> Vec<String> {
+    let comment: String = scene
+        .lines()
+        .skip_while(|line| !line.contains("terrafarm terrain import"))
+        .take_while(|line| line.starts_with('#'))
+        .map(|line| line.trim_start_matches('#').trim().trim_end_matches('\\'))
+        .collect::<Vec<_>>()
+        .join(" ");
+    let words = comment.split_whitespace().skip(1).map(str::to_owned);
+    words.take_while(|word| word != "-o").collect()
+}
+
+#[test]
+fn the_example_scenes_of_real_terrain_can_be_imported_and_rendered() {
+    if shared_data().is_none() {
+        return;
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let dir = Dir::new();
+    for name in ["zion", "santa_barbara", "helens", "fuji", "rmnp"] {
+        let scene = fs::read_to_string(root.join(format!("deploy/scenes/{name}.toml"))).unwrap();
+        let store = dir.path(&format!("{name}.terrain"));
+        succeed(terrafarm().current_dir(root).args(import_command(&scene)).arg("-o").arg(&store));
+        let here = scene.replace(&format!("../../out/{name}.terrain"), &format!("{name}.terrain"));
+        let scene = dir.write(&format!("{name}.toml"), here);
+        let picture = dir.path(&format!("{name}.png"));
+        succeed(
+            terrafarm()
+                .arg("render")
+                .arg(&scene)
+                .arg("--flight")
+                .arg(root.join(format!("deploy/scenes/{name}.csv")))
+                .args(["--frames", "300..301", "--size", "160x90", "--workers", "1", "-o"])
+                .arg(&picture),
+        );
+        let (_, _, pixels) = read_png(&picture);
+        let shades: std::collections::BTreeSet<_> = pixels.chunks_exact(3).collect();
+        assert!(shades.len() > 500, "{name}: only {} colours", shades.len());
+    }
+}

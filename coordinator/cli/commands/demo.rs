@@ -21,7 +21,7 @@ const SIZE: (u32, u32) = (1280, 720);
 /// Frames per second.
 const FPS: f64 = 24.0;
 /// The frame kept as a picture.
-const POSTER: u32 = 30;
+const POSTER: u32 = 20;
 
 /// Makes terrain, renders a flight, leaves a video.
 pub fn run(args: &args::Demo) -> anyhow::Result<Outcome> {
