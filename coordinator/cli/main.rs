@@ -41,10 +41,25 @@ fn main() -> ExitCode {
         Ok(Outcome::FailedFrames) => ExitCode::from(1),
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("terrafarm: {error:#}");
+            eprintln!("terrafarm: {}", one_line(&error));
             ExitCode::from(2)
         }
     }
+}
+
+/// What went wrong and why, on one line. Many errors of libraries tell their cause
+/// themselves; it is not said twice.
+fn one_line(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if text.is_empty() {
+            text = cause;
+        } else if !text.contains(&cause) {
+            text.push_str(": ");
+            text.push_str(&cause);
+        }
+    }
+    text
 }
 
 /// Whoever read our output has seen enough (`terrafarm ... | head`).
@@ -63,4 +78,16 @@ fn log_to_stderr(verbose: u8) {
         _ => tracing::Level::DEBUG,
     };
     tracing_subscriber::fmt().with_max_level(level).with_writer(std::io::stderr).init();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn causes_stand_on_one_line_and_none_twice() {
+        let io = std::io::Error::other("disk on fire");
+        let error = anyhow::Error::new(io).context("cannot write x: disk on fire");
+        assert_eq!(one_line(&error.context("no store")), "no store: cannot write x: disk on fire");
+    }
 }
