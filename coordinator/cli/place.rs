@@ -3,16 +3,19 @@
 
 use crate::input::flight::{Bounds, Place};
 use anyhow::Context;
+use std::cell::RefCell;
 use terrafarm_geo::Crs;
 use terrafarm_terrain::info::summary;
 use terrafarm_terrain::sample::height_at;
-use terrafarm_terrain::store::StoreReader;
+use terrafarm_terrain::store::{StoreError, StoreReader};
 
 /// A store and its reference system.
 pub struct StorePlace<'a> {
     store: &'a StoreReader,
     crs: Crs,
     bounds: Bounds,
+    /// Why the ground could not be read, the first time.
+    broken: RefCell<Option<StoreError>>,
 }
 
 impl<'a> StorePlace<'a> {
@@ -22,7 +25,13 @@ impl<'a> StorePlace<'a> {
             format!("{}: cannot use its reference system", store.path().display())
         })?;
         let info = summary(store);
-        Ok(StorePlace { store, crs, bounds: Bounds { min: info.min, max: info.max } })
+        let bounds = Bounds { min: info.min, max: info.max };
+        Ok(StorePlace { store, crs, bounds, broken: RefCell::new(None) })
+    }
+
+    /// Fails if the store could not be read where the flight asked for the ground.
+    pub fn check(&self) -> anyhow::Result<()> {
+        self.broken.take().map_or(Ok(()), |why| Err(why.into()))
     }
 
     /// Bearing of true north on the grid at the middle of the terrain, degrees.
@@ -47,7 +56,10 @@ impl Place for StorePlace<'_> {
     }
 
     fn ground(&self, x: f64, y: f64) -> Option<f64> {
-        height_at(self.store, x, y).ok().flatten()
+        height_at(self.store, x, y).unwrap_or_else(|why| {
+            self.broken.borrow_mut().get_or_insert(why);
+            None
+        })
     }
 
     fn bounds(&self) -> Bounds {

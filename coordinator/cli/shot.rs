@@ -91,7 +91,10 @@ impl Plan {
         let store = StoreReader::open(&scene.terrain)
             .with_context(|| format!("cannot use the terrain of {}", choice.scene.display()))?;
         let place = StorePlace::new(&store)?;
-        let file = flight::read(choice.flight, &place, scene.hfov_deg)?;
+        let file = flight::read(choice.flight, &place, scene.hfov_deg);
+        // A damaged store is the cause of whatever else seems wrong.
+        place.check()?;
+        let file = file?;
         for warning in &file.warnings {
             eprintln!("terrafarm: warning: {warning}");
         }

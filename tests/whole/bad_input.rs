@@ -109,16 +109,17 @@ fn a_corrupt_tile_fails_the_frames_that_need_it_and_says_which() {
     let middle = bytes.len() / 4;
     bytes[middle] ^= 0x55;
     fs::write(&store, bytes).unwrap();
-    let output = world.dir.path("out");
-    let result = world
-        .render()
-        .args(["--size", "64x36", "--frames", "0..2", "--workers", "1", "-o"])
-        .arg(&output)
-        .output()
-        .unwrap();
-    let stderr = String::from_utf8(result.stderr).unwrap();
-    assert_ne!(result.status.code(), Some(0), "{stderr}");
-    assert!(stderr.contains("tile") || stderr.contains("corrupt"), "{stderr}");
+    // Once where the flight asks for the height of the ground, once where rays do.
+    let by_height = "t,x,y,z,heading,pitch\n0,200,200,4000,45,-80\n1,210,210,4000,45,-80\n";
+    for flight in [fs::read_to_string(&world.flight).unwrap(), by_height.to_owned()] {
+        fs::write(&world.flight, flight).unwrap();
+        let mut render = world.render();
+        render.args(["--size", "64x36", "--frames", "0..2", "--workers", "1", "-o"]);
+        let result = render.arg(world.dir.path("out")).output().unwrap();
+        let stderr = String::from_utf8(result.stderr).unwrap();
+        assert_ne!(result.status.code(), Some(0), "{stderr}");
+        assert!(stderr.contains("tile") || stderr.contains("corrupt"), "{stderr}");
+    }
 }
 
 /// A render that must fail before it starts.

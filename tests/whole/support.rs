@@ -87,7 +87,7 @@ impl World {
         let flight = dir.write(
             "flight.csv",
             format!(
-                "t,x,y,z,heading,pitch,roll,hfov\n0,{a},{a},4000,45,-20,0,60\n2,{b},{b},4200,60,-25,10,60\n",
+                "t,x,y,agl,heading,pitch,roll,hfov\n0,{a},{a},300,45,-20,0,60\n2,{b},{b},400,60,-25,10,60\n",
                 a = span * 0.1,
                 b = span * 0.3
             ),
