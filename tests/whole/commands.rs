@@ -67,6 +67,23 @@ fn read_png(path: &Path) -> (u32, u32, Vec<u8>) {
 }
 
 #[test]
+fn the_slow_twin_makes_the_same_picture() {
+    let world = World::new(60);
+    let render = |method: &str| {
+        let output = world.dir.path(method);
+        succeed(
+            world
+                .render()
+                .args(["--size", "96x54", "--frames", "0..2", "--workers", "1", "--samples", "1"])
+                .args(["--method", method, "-o"])
+                .arg(&output),
+        );
+        crate::support::frame_hashes(&output.join("manifest.json"))
+    };
+    assert_eq!(render("exact"), render("reference"));
+}
+
+#[test]
 fn mp4_and_y4m_hold_the_frames_and_their_colours() {
     if !oracle("ffmpeg") {
         return;

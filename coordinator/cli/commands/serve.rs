@@ -24,9 +24,15 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
             .await
             .with_context(|| format!("cannot listen on {address}; is another coordinator running there?"))?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
+        // "Any address" is no address to connect to: this PC's name is.
+        let reach = if address.ip().is_unspecified() {
+            format!("{}:{}", pc_name(), address.port())
+        } else {
+            address.to_string()
+        };
         println!("coordinator on {address}");
-        println!("start workers with:  terrafarm worker --coordinator {address}");
-        println!("render with:         terrafarm render SCENE --flight FLIGHT -o OUT --coordinator {address}");
+        println!("start workers with:  terrafarm worker --coordinator {reach}");
+        println!("render with:         terrafarm render SCENE --flight FLIGHT -o OUT --coordinator {reach}");
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             ..Config::default()
