@@ -7,6 +7,7 @@ use crate::png_file::check_size;
 use crate::sidecar::Placement;
 use crate::source::{Source, conversion_hint};
 use crate::whole::WholePhoto;
+use std::panic::AssertUnwindSafe;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
@@ -63,7 +64,14 @@ pub fn open(source: Source, options: &OpenOptions) -> Result<Box<dyn Raster>, Ra
         );
         return Err(RasterError::damaged(path, what));
     }
-    let pixels = decoder.decode().map_err(damaged)?;
+    // The decoder has been seen to panic on a damaged file (see `is_sampling_usual`); the
+    // next such file shall be an error, too.
+    let pixels = std::panic::catch_unwind(AssertUnwindSafe(|| decoder.decode()))
+        .map_err(|_| {
+            let what = format!("the JPEG cannot be decoded; {}", conversion_hint(path));
+            RasterError::damaged(path, what)
+        })?
+        .map_err(damaged)?;
     if pixels.len() as u64 != width * height * 3 {
         let what = format!("this kind of JPEG is not read; {}", conversion_hint(path));
         return Err(RasterError::unsupported(path, what));
