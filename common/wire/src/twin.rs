@@ -80,10 +80,11 @@ impl TryFrom<RegionTwin> for Region {
 }
 
 /// Twin of [`Quality`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct QualityTwin {
     method: u16,
     samples_per_side: u32,
+    tolerance_px: f64,
 }
 
 impl From<Quality> for QualityTwin {
@@ -91,8 +92,14 @@ impl From<Quality> for QualityTwin {
         let method = match quality.method {
             Method::Exact => 0,
             Method::Reference => 1,
+            Method::Auto => 2,
+            Method::Lod => 3,
+            Method::Column => 4,
+            Method::Frustum => 5,
+            Method::Voxel => 6,
         };
-        QualityTwin { method, samples_per_side: quality.samples_per_side }
+        let Quality { samples_per_side, tolerance_px, .. } = quality;
+        QualityTwin { method, samples_per_side, tolerance_px }
     }
 }
 
@@ -103,9 +110,15 @@ impl TryFrom<QualityTwin> for Quality {
         let method = match twin.method {
             0 => Method::Exact,
             1 => Method::Reference,
+            2 => Method::Auto,
+            3 => Method::Lod,
+            4 => Method::Column,
+            5 => Method::Frustum,
+            6 => Method::Voxel,
             code => return Err(Unfit(format!("method number {code} is not known"))),
         };
-        let quality = Quality { method, samples_per_side: twin.samples_per_side };
+        let QualityTwin { samples_per_side, tolerance_px, .. } = twin;
+        let quality = Quality { method, samples_per_side, tolerance_px };
         fit_quality(quality)?;
         Ok(quality)
     }
@@ -243,11 +256,7 @@ pub(crate) fn fit_size(width: u32, height: u32) -> Result<(), Unfit> {
 
 /// Refuses a number of samples out of range.
 pub(crate) fn fit_quality(quality: Quality) -> Result<(), Unfit> {
-    let samples = 1..=Quality::MAX_SAMPLES_PER_SIDE;
-    Unfit::unless(
-        samples.contains(&quality.samples_per_side),
-        "the number of samples is out of range",
-    )
+    Unfit::unless(quality.is_valid(), "the number of samples or the tolerance is out of range")
 }
 
 /// Refuses tiles without pixels, or larger than any frame.
@@ -337,12 +346,16 @@ mod tests {
     #[test]
     fn every_method_has_a_number_and_others_are_refused() {
         for method in Method::ALL {
-            let quality = Quality { method, samples_per_side: 3 };
+            let quality = Quality { method, samples_per_side: 3, tolerance_px: 0.25 };
             assert_eq!(Quality::try_from(QualityTwin::from(quality)), Ok(quality));
         }
-        assert!(Quality::try_from(QualityTwin { method: 77, samples_per_side: 1 }).is_err());
-        assert!(Quality::try_from(QualityTwin { method: 0, samples_per_side: 0 }).is_err());
-        assert!(Quality::try_from(QualityTwin { method: 0, samples_per_side: 33 }).is_err());
+        let twin = QualityTwin::from(Quality::default());
+        assert!(Quality::try_from(QualityTwin { method: 77, ..twin }).is_err());
+        assert!(Quality::try_from(QualityTwin { samples_per_side: 0, ..twin }).is_err());
+        assert!(Quality::try_from(QualityTwin { samples_per_side: 33, ..twin }).is_err());
+        for tolerance_px in [0.0, -1.0, 65.0, f64::NAN, f64::INFINITY] {
+            assert!(Quality::try_from(QualityTwin { tolerance_px, ..twin }).is_err());
+        }
     }
 
     #[test]

@@ -21,7 +21,7 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     let scene = read_scene(&args.scene)?;
     let mut quality = scene.quality;
     if let Some(method) = args.method {
-        quality = Quality { method, samples_per_side: default_samples(method) };
+        quality = Quality { method, samples_per_side: default_samples(method), ..quality };
     }
     if let Some(samples) = args.samples {
         quality.samples_per_side = samples;
@@ -54,8 +54,8 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
 /// Samples along a side of a pixel unless the user says otherwise.
 fn default_samples(method: Method) -> u32 {
     match method {
-        Method::Exact => 1,
         Method::Reference => 8,
+        _ => 1,
     }
 }
 

@@ -236,7 +236,7 @@ impl SceneFile {
             size,
             hfov_deg,
             fps: number(self.output.fps, "[output] fps", 30.0, 0.001, 1000.0)?,
-            quality: Quality { method, samples_per_side: samples as u32 },
+            quality: Quality { method, samples_per_side: samples as u32, ..Quality::default() },
             sun,
             haze,
             sky,

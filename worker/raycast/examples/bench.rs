@@ -166,7 +166,7 @@ fn view(
             below_ground: [0.05, 0.03, 0.02],
             bare_ground: None,
         },
-        quality: Quality { samples_per_side: 1, method: Method::Exact },
+        quality: Quality::default(),
     }
 }
 

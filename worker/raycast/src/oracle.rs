@@ -52,7 +52,7 @@ impl Land {
             width: 1,
             height: 1,
         };
-        let quality = Quality { method, samples_per_side: 1 };
+        let quality = Quality { method, ..Quality::default() };
         let view = View { camera, shading: bare(earth), quality };
         self.look(&view, [0.5, 0.5])
     }

@@ -157,8 +157,8 @@ enum Caster<'a> {
 impl<'a> Caster<'a> {
     fn new(field: Field<'a>, method: Method) -> Self {
         match method {
-            Method::Exact => Caster::Exact(Exact::new(field)),
             Method::Reference => Caster::Reference(Reference::new(field)),
+            _ => Caster::Exact(Exact::new(field)),
         }
     }
 

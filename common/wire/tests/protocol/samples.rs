@@ -46,7 +46,7 @@ fn pixels() -> Pixels {
 /// One message of every kind, with both variants where there are two.
 pub fn all() -> Vec<(String, Message)> {
     let hash = BlobHash(std::array::from_fn(|i| i as u8));
-    let quality = Quality { method: Method::Reference, samples_per_side: 8 };
+    let quality = Quality { method: Method::Reference, samples_per_side: 8, tolerance_px: 0.25 };
     let (shot, lease, frame, number) = (ShotId(300), LeaseId(70_000), 17, 5);
     let text = || "because: é".to_owned();
     let hello = |role| Hello {
@@ -170,8 +170,13 @@ pub fn any_shading() -> impl Strategy<Value = Shading> {
 }
 
 fn any_quality() -> impl Strategy<Value = Quality> {
-    (prop::sample::select(&Method::ALL[..]), 1u32..=32)
-        .prop_map(|(method, samples_per_side)| Quality { method, samples_per_side })
+    (prop::sample::select(&Method::ALL[..]), 1u32..=32, 0.01..=64.0f64).prop_map(
+        |(method, samples_per_side, tolerance_px)| Quality {
+            method,
+            samples_per_side,
+            tolerance_px,
+        },
+    )
 }
 
 fn any_hash() -> impl Strategy<Value = BlobHash> {

@@ -69,7 +69,10 @@ fn values_are_taken_over() {
     "##;
     let scene = parsed(text).unwrap();
     assert_eq!((scene.size, scene.hfov_deg, scene.fps), ((640, 480), 45.0, 29.97));
-    assert_eq!(scene.quality, Quality { method: Method::Reference, samples_per_side: 4 });
+    assert_eq!(
+        scene.quality,
+        Quality { method: Method::Reference, samples_per_side: 4, ..Quality::default() }
+    );
     assert_eq!(scene.sky, Sky { zenith: [0.0; 3], ..Sky::default() });
     let shading = scene.shading(Some(6.37e6), 0.0).unwrap();
     assert_eq!(shading.earth, None);

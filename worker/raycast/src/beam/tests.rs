@@ -10,7 +10,7 @@ use crate::tests_support::{Plan, mountains, noise};
 use crate::{View, render};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
-use terrafarm_common::quality::{Method, Quality};
+use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Earth, Haze, Shading, Sky, Sun};
 
@@ -46,7 +46,7 @@ fn view(land: &Land, dice: &mut Dice) -> View {
             below_ground: [0.05, 0.03, 0.02],
             bare_ground: None,
         },
-        quality: Quality { samples_per_side: 1, method: Method::Exact },
+        quality: Quality::default(),
     }
 }
 

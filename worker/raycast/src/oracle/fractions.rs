@@ -334,7 +334,7 @@ fn cast_finds_the_cells_of_rational_arithmetic() {
             let (expected, certain) = answers(&layers, &ray);
             let [start, direction] = [ray.start, ray.direction]
                 .map(|[x, y, z]| DVec3::new(x as f64, y as f64, z as f64));
-            for method in Method::ALL {
+            for method in [Method::Exact, Method::Reference] {
                 let hit = land.cast(method, None, start, direction);
                 let fits = match &hit {
                     None => !certain,

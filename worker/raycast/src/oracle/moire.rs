@@ -92,7 +92,8 @@ fn a_checkerboard_at_the_horizon_is_neither_moire_nor_blur() {
     {
         let place = DVec3::new(1203.0, 1207.0, height);
         let camera = Camera::from_angles(place, heading, pitch, 0.0, 50.0, SIZE);
-        let quality = |method, samples_per_side| Quality { method, samples_per_side };
+        let quality =
+            |method, samples_per_side| Quality { method, samples_per_side, ..Quality::default() };
         let view = View { camera, shading: bare(earth), quality: quality(Method::Exact, 1) };
         let truth = View { quality: quality(Method::Reference, 8), ..view.clone() };
         let all = Region::whole(SIZE.0, SIZE.1);

@@ -57,7 +57,7 @@ fn view(land: &Land, samples_per_side: u32) -> View {
     View {
         camera: Camera::from_angles(at, 40.0, -12.0, 5.0, 60.0, SIZE),
         shading: shading(),
-        quality: Quality { method: Method::Exact, samples_per_side },
+        quality: Quality { samples_per_side, ..Quality::default() },
     }
 }
 
@@ -187,7 +187,7 @@ fn pictures_are_sound_and_the_same_by_both_methods_from_everywhere() {
     for earth in [None, shading().earth] {
         for (what, camera, below) in cameras(&land) {
             assert!(camera.is_valid(), "{what}");
-            let quality = |method| Quality { method, samples_per_side: 1 };
+            let quality = |method| Quality { method, ..Quality::default() };
             let shading = Shading { earth, ..shading() };
             let exact = View { camera, shading, quality: quality(Method::Exact) };
             let slow = View { quality: quality(Method::Reference), ..exact.clone() };
