@@ -355,6 +355,37 @@ pub fn trace(
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
 }
 
+/// The distances that a method finds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Depths {
+    /// Straight distance from the camera through the centre of each pixel, metres, rows
+    /// from the top; infinite where there is no ground, 0 for a camera at or below it.
+    pub distance_m: Vec<f32>,
+    /// What it took.
+    pub stats: Stats,
+}
+
+/// The distances of a region, one ray through the centre of each pixel, by the method of
+/// the view.
+///
+/// # Errors
+/// If tiles are missing.
+pub fn depths(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+) -> Result<Depths, Missing> {
+    let mut distance_m = vec![f32::INFINITY; region.area() as usize];
+    let stats = trace(resident, pyramid, view, region, |x, y, hit| {
+        let (column, row) = ((x - region.x) as usize, (y - region.y) as usize);
+        if let Some(hit) = hit {
+            distance_m[row * region.width as usize + column] = hit.distance_m as f32;
+        }
+    })?;
+    Ok(Depths { distance_m, stats })
+}
+
 impl Hit {
     fn new(path: &Path, contact: &Contact) -> Self {
         let along = path.direction * contact.u;
