@@ -26,7 +26,7 @@ fn bytes_per_post(store: &Imported) -> f64 {
 #[test]
 fn resampled_heights_are_multiples_of_a_step_and_the_report_says_so() {
     let raster =
-        MemoryRaster::heights(UTM, [300_000.0, 4_100_000.0], [30.0; 2], [684, 684], smooth);
+        MemoryRaster::heights(UTM, [300_000.0, 4_100_000.0], [30.0; 2], [683, 683], smooth);
     let settings = ImportSettings { spacing_m: Some(20.0), ..plain() };
     let store = import(sources(vec![raster]), &settings);
     let mut heights = store.heights(0);
