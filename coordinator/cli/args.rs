@@ -4,6 +4,7 @@ use crate::input::{parse_method, parse_tolerance};
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::quality::Method;
 use terrafarm_common::region::Split;
 
@@ -70,6 +71,10 @@ pub struct Casting {
     /// scene's, else 0.5]
     #[arg(long, value_parser = parse_tolerance, value_name = "PX", allow_negative_numbers = true)]
     pub tolerance: Option<f64>,
+    /// Measure a random share of the pixels against exact, such as 1%: error in pixels,
+    /// per frame in the manifest
+    #[arg(long, value_name = "PERCENT", default_value = "0", allow_negative_numbers = true)]
+    pub check: Share,
 }
 
 /// `terrafarm terrain ...`
