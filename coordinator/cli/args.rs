@@ -36,6 +36,8 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Render for a coordinator until told to stop
     Worker(Worker),
+    /// Say how far two pictures, or two folders of numbered pictures, are apart
+    Compare(Compare),
     /// Run the real scheduler on a virtual clock, with workers that fail
     Simulate(Simulate),
 }
@@ -318,6 +320,21 @@ pub struct Worker {
     /// End when the coordinator goes away instead of waiting for it
     #[arg(long)]
     pub once: bool,
+}
+
+/// `terrafarm compare`
+#[derive(Debug, ClapArgs)]
+pub struct Compare {
+    /// A PNG picture, or a folder of numbered ones, or the manifest in it
+    pub one: PathBuf,
+    /// What to compare it with, of the same kind and size
+    pub other: PathBuf,
+    /// Write the differences, amplified, as a PNG; of a sequence, those of the worst pair
+    #[arg(long, value_name = "FILE")]
+    pub difference: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `terrafarm simulate`
