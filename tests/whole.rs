@@ -22,6 +22,10 @@ mod bad_input;
 #[path = "whole/commands.rs"]
 mod commands;
 
+/// Two pictures and how far they are apart, against other programs.
+#[path = "whole/compare.rs"]
+mod compare;
+
 /// Every command in the documents is one that works.
 #[path = "whole/documents.rs"]
 mod documents;

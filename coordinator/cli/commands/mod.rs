@@ -1,5 +1,6 @@
 //! One module a command.
 
+mod compare;
 mod demo;
 mod render;
 mod serve;
@@ -25,6 +26,7 @@ pub fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Render(args) => render::run(&args),
         Command::Coordinator(args) => serve::coordinator(&args),
         Command::Worker(args) => serve::worker(args),
+        Command::Compare(args) => compare::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     }
 }
