@@ -42,6 +42,9 @@ fn main() {
         ("rolled", DVec3::new(510240.0, 5010240.0, 3552.300049), 50.0, -30.0, 45.0),
     ];
     for (name, eye, heading, pitch, roll) in cameras {
+        if std::env::var("CAM").is_ok_and(|cam| cam != name) {
+            continue;
+        }
         let view = |method| View {
             camera: Camera::from_angles(eye, heading, pitch, roll, 60.0, (1920, 1080)),
             shading: Shading {

@@ -32,6 +32,8 @@ mod exact;
 mod field;
 mod grid;
 mod lanes;
+mod lattice;
+mod lod;
 pub mod meter;
 #[cfg(test)]
 mod oracle;

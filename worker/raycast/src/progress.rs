@@ -382,13 +382,18 @@ pub fn depths(
     if view.quality.method == Method::Column {
         if let Some(relief) = Relief::new(field, view) {
             let columns = Columns { relief: &relief, camera: &view.camera, tolerance_px: view.quality.tolerance_px, region };
-            let seen = lanes::run(columns, std::env::var("WIDTH").map_or(lanes::widest(), |w| if w == "8" { lanes::Width::Eight } else if w == "1" { lanes::Width::One } else { lanes::widest() }));
-            let stats = Stats { hits: seen.fallen, rays: seen.rays, steps: seen.steps, ..Stats::default() };
+            let seen = lanes::run(columns, lanes::widest());
+            let stats = Stats { hits: seen.alone, rays: seen.rays, steps: seen.steps, ..Stats::default() };
             let wanted = relief.wanted();
             if !wanted.is_empty() {
                 return Err(Missing(wanted));
             }
-            return Ok(Depths { distance_m: seen.distance, stats });
+            let mut distance_m = seen.inverse_depth;
+            for (distance, [x, y]) in distance_m.iter_mut().zip(region.pixels()) {
+                let ray = view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                *distance = ray.length() as f32 / *distance;
+            }
+            return Ok(Depths { distance_m, stats });
         }
     }
     let mut distance_m = vec![f32::INFINITY; region.area() as usize];

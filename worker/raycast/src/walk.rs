@@ -61,7 +61,9 @@ pub(crate) struct Slopes<L: Lanes> {
 
 /// The rays of each line, in the order in which they rise: ray n has the tangent of
 /// elevation `(rise + d higher) / (length + d longer)` with `d = first + n step`, and its
-/// answer belongs at `at + n pitch`.
+/// answer belongs at `at + n pitch`. The answer is the inverse depth: the ray's length
+/// along the map, `length + d longer`, over the distance at which it meets the ground. Of
+/// flat ground it is a plane over the picture.
 pub(crate) struct Rows<L: Lanes> {
     pub rise: L::F,
     pub higher: L::F,
@@ -82,6 +84,7 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     /// The ray that each lane casts, and its slope.
     row: L::I,
     slopes: Slopes<L>,
+    across: L::F,
     /// The plot, or `NOWHERE` if the lane has left the layer or cast its last ray.
     plot: L::I,
     /// How far the ray is known to be free.
@@ -222,10 +225,12 @@ impl<L: Lanes> Slopes<L> {
 }
 
 impl<L: Lanes> Rows<L> {
+    /// The slope of a ray, and its length along the map.
     #[inline(always)]
-    fn slopes(&self, relief: &Relief, row: L::I) -> Slopes<L> {
+    fn ray(&self, relief: &Relief, row: L::I) -> (Slopes<L>, L::F) {
         let d = L::F::splat(self.first) + row.to_floats() * L::F::splat(self.step);
-        Slopes::new(relief, (self.rise + d * self.higher).div(self.length + d * self.longer))
+        let across = self.length + d * self.longer;
+        (Slopes::new(relief, (self.rise + d * self.higher).div(across)), across)
     }
 }
 
@@ -272,13 +277,14 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let row = lines.cell_after(relief, 1, free, level, zero, last);
         let plot = row.times(L::I::splat(relief.plots[0])) + column;
         let plot = L::I::select(free.lt(lines.leave), plot, L::I::splat(NOWHERE));
-        let slopes = rows.slopes(relief, zero);
+        let (slopes, across) = rows.ray(relief, zero);
         Walk {
             relief,
             lines,
             rows,
             row: zero,
             slopes,
+            across,
             plot,
             free,
             unsure: L::M::none(),
@@ -286,9 +292,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         }
     }
 
-    /// Casts all rays. One over the distance on the map at which they meet the surface
-    /// goes to `met`: NaN where a missing tile leaves it open, and nothing for rays that
-    /// meet nothing.
+    /// Casts all rays. The answers go to `met`: NaN where a missing tile leaves them open,
+    /// and nothing for rays that meet nothing.
     #[inline(always)]
     pub(crate) fn run(&mut self, met: &mut [f32]) {
         let nowhere = L::I::splat(NOWHERE);
@@ -324,10 +329,10 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
 
     /// Writes the answers of lanes; these go on with their next rays.
     #[inline(always)]
-    fn emit(&mut self, s: L::F, lanes: L::M, met: &mut [f32]) {
+    fn emit(&mut self, answer: L::F, lanes: L::M, met: &mut [f32]) {
         let at = self.rows.at + self.row.times(L::I::splat(self.rows.pitch));
-        let s = L::F::select(self.unsure, L::F::splat(f32::NAN), s);
-        s.scatter(met, at, lanes);
+        let answer = L::F::select(self.unsure, L::F::splat(f32::NAN), answer);
+        answer.scatter(met, at, lanes);
         let next = self.row + L::I::splat(1);
         self.row = L::I::select(lanes, next, self.row);
     }
@@ -439,8 +444,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 let hit = hit & ready;
                 if hit.any() {
                     let inside = hit & s.lt(self.lines.leave);
-                    self.emit(L::F::splat(1.0).div(s), inside, met);
-                    self.slopes = self.rows.slopes(relief, self.row);
+                    self.emit(self.across.div(s), inside, met);
+                    (self.slopes, self.across) = self.rows.ray(relief, self.row);
                     let done = hit & !(inside & self.row.lt(L::I::splat(self.rows.count)));
                     self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
                     left = left & !done;
