@@ -105,8 +105,7 @@ impl Caster for RayCaster {
         // A pixel does not depend on the region that it is asked for in.
         let alone = Region { x, y, width: 1, height: 1 };
         let found = depths(resident, pyramid, view, alone).map_err(|Missing(tiles)| tiles)?;
-        let claimed = found.distance_m.first().map_or(f64::NAN, |distance| f64::from(*distance));
-        measure(resident, pyramid, view, x, y, claimed).map_err(|Missing(tiles)| tiles)
+        measure(resident, pyramid, view, x, y, found.distance_m(view, x, y)).map_err(|Missing(tiles)| tiles)
     }
 }
 

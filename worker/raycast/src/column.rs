@@ -13,7 +13,7 @@
 
 use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use crate::lattice::{Band, Fan, Frame};
-use crate::lod::cast_pixels;
+use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
 use crate::walk::{Lines, Rows, Walk, as_bits};
 use glam::DVec2;
@@ -24,7 +24,7 @@ use terrafarm_common::region::Region;
 /// Distance between lines, pixels for each pixel of tolerance, and the least and the most.
 /// Measured (`bench core`): the 99th percentile of the error then is below the tolerance
 /// by a quarter.
-const SPACING: f64 = 4.0;
+const SPACING: f64 = 5.0;
 const SPACINGS: [f64; 2] = [0.5, 4.0];
 /// Rays see neighbouring ground if their depths differ by no more than this share.
 const NEIGHBOURS: f32 = 0.02;
@@ -90,7 +90,8 @@ impl Kernel for Columns<'_, '_> {
                     if !spans.iter().all(|span| span.pixels.is_empty()) {
                         let first = band.rows.start.max(part[1].start);
                         self.cast::<L>(&frame, &fan, first, &spans, &mut net, &mut seen);
-                        for (span, row) in spans.iter().zip(first..) {
+                        let filled = spans.iter().zip(first..);
+                        for (span, row) in filled.filter(|(span, _)| !span.pixels.is_empty()) {
                             done += span.pixels.len() as u64;
                             let rows = (row, span.pixels.clone());
                             self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut alone);
@@ -101,8 +102,18 @@ impl Kernel for Columns<'_, '_> {
         }
         if done < area as u64 {
             // What is close to V.
-            let near = self.region.pixels().zip(0..).filter(|(place, _)| self.is_near(*place));
-            alone.extend(near.map(|(_, at)| at));
+            let frames = [true, false].map(|by_rows| Frame::new(self.camera, by_rows));
+            let [columns, rows] = frames[0].around_v().unwrap_or([0..0, 0..0]);
+            for (at, [x, y]) in (0..).zip(self.region.pixels()) {
+                if !columns.contains(&x) || !rows.contains(&y) {
+                    continue;
+                }
+                let near = frames[0].owns(x, y) && frames[0].is_near(y)
+                    || frames[1].owns(y, x) && frames[1].is_near(x);
+                if near {
+                    alone.push(Alone { at, nearest: f32::INFINITY });
+                }
+            }
         }
         seen.alone = alone.len() as u64;
         seen.rays += seen.alone;
@@ -141,12 +152,6 @@ fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 
 }
 
 impl Columns<'_, '_> {
-    /// Whether no band has a pixel.
-    fn is_near(&self, [x, y]: [u32; 2]) -> bool {
-        let frame = Frame::new(self.camera, true);
-        if frame.owns(x, y) { frame.is_near(y) } else { Frame::new(self.camera, false).is_near(x) }
-    }
-
     /// Casts the rays that the pixels of some rows lie between.
     #[inline(always)]
     fn cast<L: Lanes>(
@@ -250,7 +255,7 @@ impl Columns<'_, '_> {
         (row, pixels): (u32, Range<u32>),
         net: &Net,
         seen: &mut Seen,
-        alone: &mut Vec<u32>,
+        alone: &mut Vec<Alone>,
     ) {
         let d = f64::from(row) + 0.5 - fan.reference;
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
@@ -267,6 +272,7 @@ impl Columns<'_, '_> {
         let region = self.region;
         let mut places = [0; MOST];
         let mut out = [0.0f32; MOST];
+        let mut nearest = [0.0f32; MOST];
         for pixel in pixels.clone().step_by(L::N) {
             let minor = numbers + L::F::splat(pixel as f32 + 0.5);
             let line = start + minor * scale_f;
@@ -298,6 +304,9 @@ impl Columns<'_, '_> {
             let answer = above + (below - above) * down;
             let count = L::N.min((pixels.end - pixel) as usize);
             let mut strange = (!close).bits() & (u32::MAX >> (32 - count));
+            if strange != 0 {
+                high.store(&mut nearest);
+            }
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
@@ -308,7 +317,9 @@ impl Columns<'_, '_> {
                     seen.inverse_depth[at..at + count].copy_from_slice(&out[..count]);
                 }
                 while strange != 0 {
-                    alone.push(at as u32 + strange.trailing_zeros());
+                    let lane = strange.trailing_zeros();
+                    let nearest = nearest[lane as usize % MOST];
+                    alone.push(Alone { at: at as u32 + lane, nearest });
                     strange &= strange - 1;
                 }
             } else {
@@ -320,8 +331,10 @@ impl Columns<'_, '_> {
                     pixels[column] = answer;
                 }
                 while strange != 0 {
-                    let lower = strange.trailing_zeros() * region.width;
-                    alone.push((at + column) as u32 + lower);
+                    let lane = strange.trailing_zeros();
+                    let nearest = nearest[lane as usize % MOST];
+                    let at = (at + column) as u32 + lane * region.width;
+                    alone.push(Alone { at, nearest });
                     strange &= strange - 1;
                 }
             }

@@ -85,6 +85,19 @@ impl Frame {
         if self.by_rows { along >= across } else { along > across }
     }
 
+    /// The part of the picture in which pixels may be too close to V for any band: columns
+    /// and rows of the picture, if V is in it.
+    pub(crate) fn around_v(&self) -> Option<[Range<u32>; 2]> {
+        let [minor, major, w] = self.v;
+        let range = |at: f64, size: u32| {
+            let (low, high) = (at / w - NEAREST_PX - 2.0, at / w + NEAREST_PX + 2.0);
+            let range = low.clamp(0.0, f64::from(size)) as u32..high.clamp(0.0, f64::from(size)) as u32;
+            (!range.is_empty()).then_some(range)
+        };
+        let (minor, major) = (range(minor, self.size[0])?, range(major, self.size[1])?);
+        Some(if self.by_rows { [minor, major] } else { [major, minor] })
+    }
+
     /// Whether a row is too close to V for any band.
     pub(crate) fn is_near(&self, row: u32) -> bool {
         self.apart(f64::from(row) + 0.5).abs() <= NEAREST_PX * self.v[2].abs()
@@ -132,7 +145,7 @@ impl Frame {
         let first = if band.falling { band.rows.end - 1 } else { band.rows.start };
         let reference = f64::from(first) + 0.5;
         let scale = 1.0 / self.apart(reference);
-        let every = spacing.floor().max(1.0);
+        let every = (0.5 * spacing).floor().max(1.0);
         Fan {
             reference,
             spacing,

@@ -290,6 +290,9 @@ pub struct Hit {
     pub height: f64,
     /// Distance from the camera, metres.
     pub distance_m: f64,
+    /// The same measured over the map and along the ray's start; over flat ground it is
+    /// the distance.
+    pub parameter_m: f64,
 }
 
 /// Tiles that a question depends on but that are not loaded, sorted.
@@ -358,14 +361,36 @@ pub fn trace(
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
 }
 
-/// Straight distances from the camera.
+/// How far away is what is seen through the centres of the pixels of a region.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Depths {
-    /// Distance of what is seen through the centre of each pixel, metres, rows from the
-    /// top; infinite for the sky.
-    pub distance_m: Vec<f32>,
+    /// The pixels.
+    pub region: Region,
+    /// One over the depth of each pixel, per metre, rows from the top; 0 for the sky. The
+    /// depth is the distance along the axis of the camera: what is seen is at
+    /// `ray / inverse_depth` from the camera, with the pixel's [`Camera::ray`]. Over a round
+    /// Earth that holds along the map.
+    pub inverse_depth: Vec<f32>,
     /// What it took.
     pub stats: Stats,
+}
+
+impl Depths {
+    /// Straight distance from the camera of what a pixel of the region shows, metres;
+    /// infinite for the sky. The view must be the same.
+    pub fn distance_m(&self, view: &View, x: u32, y: u32) -> f64 {
+        let (column, row) = (x - self.region.x, y - self.region.y);
+        let at = row as usize * self.region.width as usize + column as usize;
+        let inverse = f64::from(self.inverse_depth[at]);
+        if inverse == 0.0 {
+            return f64::INFINITY;
+        }
+        let ground = Ground::new(view.shading.earth);
+        let place = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+        let length = view.camera.ray(place[0], place[1]).length();
+        let (path, _) = path(&view.camera, ground, place, 0.0);
+        path.distance_at(length / inverse)
+    }
 }
 
 /// How far away is what is seen through the centres of the pixels of a region.
@@ -381,29 +406,28 @@ pub fn depths(
     let field = Field { resident, pyramid };
     if view.quality.method == Method::Column {
         if let Some(relief) = Relief::new(field, view) {
-            let columns = Columns { relief: &relief, camera: &view.camera, tolerance_px: view.quality.tolerance_px, region };
+            let tolerance_px = view.quality.tolerance_px;
+            let columns = Columns { relief: &relief, camera: &view.camera, tolerance_px, region };
             let seen = lanes::run(columns, lanes::widest());
-            let stats = Stats { hits: seen.alone, rays: seen.rays, steps: seen.steps, ..Stats::default() };
+            let stats =
+                Stats { hits: seen.alone, rays: seen.rays, steps: seen.steps, ..Stats::default() };
             let wanted = relief.wanted();
             if !wanted.is_empty() {
                 return Err(Missing(wanted));
             }
-            let mut distance_m = seen.inverse_depth;
-            for (distance, [x, y]) in distance_m.iter_mut().zip(region.pixels()) {
-                let ray = view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                *distance = ray.length() as f32 / *distance;
-            }
-            return Ok(Depths { distance_m, stats });
+            return Ok(Depths { region, inverse_depth: seen.inverse_depth, stats });
         }
     }
-    let mut distance_m = vec![f32::INFINITY; region.area() as usize];
+    let mut inverse_depth = vec![0.0; region.area() as usize];
     let stats = trace(resident, pyramid, view, region, |x, y, hit| {
         let at = (y - region.y) as usize * region.width as usize + (x - region.x) as usize;
         if let Some(hit) = hit {
-            distance_m[at] = hit.distance_m as f32;
+            let place = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+            let length = view.camera.ray(place[0], place[1]).length();
+            inverse_depth[at] = (length / hit.parameter_m) as f32;
         }
     })?;
-    Ok(Depths { distance_m, stats })
+    Ok(Depths { region, inverse_depth, stats })
 }
 
 impl Hit {
@@ -419,6 +443,7 @@ impl Hit {
             position: DVec3::new(path.origin.x + along.x, path.origin.y + along.y, contact.z),
             height: contact.corners.height(u, v),
             distance_m: path.distance(contact.u, contact.z),
+            parameter_m: contact.u,
         }
     }
 }
