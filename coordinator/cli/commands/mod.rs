@@ -1,5 +1,6 @@
 //! One module a command.
 
+mod bench;
 mod demo;
 mod render;
 mod serve;
@@ -26,5 +27,6 @@ pub fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Coordinator(args) => serve::coordinator(&args),
         Command::Worker(args) => serve::worker(args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Bench(args) => bench::run(&args),
     }
 }
