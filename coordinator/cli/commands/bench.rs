@@ -10,11 +10,13 @@
 //! promise makes the exit code 1. `land` makes and loads the terrain, `kernel` asks the
 //! ray caster, `clock` reads the time that this thread had on a core.
 
+mod chart;
 mod clock;
 mod core;
 mod kernel;
 mod land;
 mod report;
+mod speed_accuracy;
 
 use crate::Outcome;
 use crate::args;
@@ -23,8 +25,7 @@ use crate::args;
 pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
     match args {
         args::Bench::Core(args) => core::run(args),
-        args::Bench::SpeedAccuracy(_) | args::Bench::Stability(_) => {
-            anyhow::bail!("this bench is being built")
-        }
+        args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
+        args::Bench::Stability(_) => anyhow::bail!("this bench is being built"),
     }
 }

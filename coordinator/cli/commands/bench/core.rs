@@ -20,6 +20,7 @@ use std::path::Path;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::flight::Pose;
 use terrafarm_common::quality::{Method, Quality};
+use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Earth, Shading, Sky};
 use terrafarm_raycast::View;
 
@@ -256,8 +257,9 @@ fn judge(land: &Land, number: usize, stand: &Stand, mut runs: Runs) -> Case {
         bytes_per_post: land.bytes_per_post(),
     };
     let Some(first) = runs.first.take() else { return case };
+    let frame = Region::whole(size[0], size[1]);
     let checked = first.and_then(|depths| {
-        let errors = kernel::errors(land, &runs.view, &depths)?;
+        let errors = kernel::errors(land, &runs.view, frame, &depths)?;
         Ok((depths, errors))
     });
     let (depths, errors) = match checked {

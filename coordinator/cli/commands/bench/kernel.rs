@@ -3,7 +3,7 @@
 use super::land::Land;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
-use terrafarm_raycast::{Missing, Pyramid, Stats, View, cast, trace};
+use terrafarm_raycast::{Missing, Pyramid, Stats, View, cast, render, trace};
 use terrafarm_terrain::resident::Resident;
 
 /// Pixels of a picture that are compared with the truth, about.
@@ -81,8 +81,22 @@ fn measure(
 
 /// The distances of a whole picture.
 pub fn answer(land: &Land, view: &View) -> Result<Depths, Refusal> {
-    let frame = Region::whole(view.camera.width, view.camera.height);
-    Ok(depths(&land.resident, &land.pyramid, view, frame)?)
+    answer_in(land, view, Region::whole(view.camera.width, view.camera.height))
+}
+
+/// The distances of a region.
+pub fn answer_in(land: &Land, view: &View, region: Region) -> Result<Depths, Refusal> {
+    Ok(depths(&land.resident, &land.pyramid, view, region)?)
+}
+
+/// The pixels of a region, shaded: three bytes of sRGB each.
+pub fn picture(land: &Land, view: &View, region: Region) -> Result<Vec<u8>, Refusal> {
+    let rendered = render(&land.resident, &land.pyramid, view, region);
+    if rendered.missing.is_empty() {
+        Ok(rendered.pixels)
+    } else {
+        Err(Missing(rendered.missing).into())
+    }
 }
 
 /// Errors of an answer over a net of its pixels.
@@ -100,17 +114,20 @@ impl Errors {
     }
 }
 
-/// Compares an answer with the surface, over a net of about 20 000 pixels.
-pub fn errors(land: &Land, view: &View, answer: &Depths) -> Result<Errors, Refusal> {
-    let (width, height) = (view.camera.width, view.camera.height);
-    let area = f64::from(width) * f64::from(height);
-    let step = (area / CHECKED_PIXELS).sqrt().ceil().max(1.0) as u32;
+/// Compares the answer for a region with the surface, over a net of about 20 000 pixels.
+pub fn errors(
+    land: &Land,
+    view: &View,
+    region: Region,
+    answer: &Depths,
+) -> Result<Errors, Refusal> {
+    let step = (region.area() as f64 / CHECKED_PIXELS).sqrt().ceil().max(1.0) as u32;
     let along = |side: u32| (((step - 1) / 2).min(side - 1)..side).step_by(step as usize);
     let mut errors = Errors { error_px: Vec::new(), mismatched: 0 };
-    for y in along(height) {
-        for x in along(width) {
-            let at = y as usize * width as usize + x as usize;
-            let claimed = answer.distance_m[at];
+    for row in along(region.height) {
+        for column in along(region.width) {
+            let claimed = answer.distance_m[row as usize * region.width as usize + column as usize];
+            let (x, y) = (region.x + column, region.y + row);
             let pixel = measure(&land.resident, &land.pyramid, view, x, y, claimed)?;
             errors.error_px.push(pixel.error_px());
             errors.mismatched += usize::from(pixel.mismatch);
