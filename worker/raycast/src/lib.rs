@@ -26,21 +26,26 @@
 
 mod beam;
 mod cell;
+mod column;
 mod exact;
 mod field;
 mod grid;
+mod lanes;
 #[cfg(test)]
 mod oracle;
 mod path;
 mod progress;
 mod pyramid;
 mod reference;
+mod relief;
 mod shade;
 mod srgb;
 #[cfg(test)]
 mod tests_support;
+mod walk;
 
-pub use progress::{Hit, Missing, Progress, Rendered, Stats, cast, trace};
+pub use lanes::Width;
+pub use progress::{Depths, Hit, Missing, Progress, Rendered, Stats, cast, depths, trace};
 pub use pyramid::Pyramid;
 
 use terrafarm_common::camera::Camera;

@@ -1,6 +1,9 @@
 //! From a region to rays, and from colours to pixels; what is done and what is not.
 
 use crate::View;
+use crate::column::Columns;
+use crate::lanes;
+use crate::relief::Relief;
 use crate::beam::{Beams, WIDEST_PX};
 use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
@@ -353,6 +356,49 @@ pub fn trace(
     }
     stats.steps = beams.steps + caster.finish(&mut missing);
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
+}
+
+/// Straight distances from the camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Depths {
+    /// Distance of what is seen through the centre of each pixel, metres, rows from the
+    /// top; infinite for the sky.
+    pub distance_m: Vec<f32>,
+    /// What it took.
+    pub stats: Stats,
+}
+
+/// How far away is what is seen through the centres of the pixels of a region.
+///
+/// # Errors
+/// If tiles are missing.
+pub fn depths(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+) -> Result<Depths, Missing> {
+    let field = Field { resident, pyramid };
+    if view.quality.method == Method::Column {
+        if let Some(relief) = Relief::new(field, view) {
+            let columns = Columns { relief: &relief, camera: &view.camera, region };
+            let seen = lanes::run(columns, lanes::widest());
+            let stats = Stats { rays: seen.rays, steps: seen.steps, ..Stats::default() };
+            let wanted = relief.wanted();
+            if !wanted.is_empty() {
+                return Err(Missing(wanted));
+            }
+            return Ok(Depths { distance_m: seen.distance, stats });
+        }
+    }
+    let mut distance_m = vec![f32::INFINITY; region.area() as usize];
+    let stats = trace(resident, pyramid, view, region, |x, y, hit| {
+        let at = (y - region.y) as usize * region.width as usize + (x - region.x) as usize;
+        if let Some(hit) = hit {
+            distance_m[at] = hit.distance_m as f32;
+        }
+    })?;
+    Ok(Depths { distance_m, stats })
 }
 
 impl Hit {

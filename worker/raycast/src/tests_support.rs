@@ -111,7 +111,11 @@ fn build_layer(number: usize, plan: Plan, tiles: &mut Vec<(TileKey, Tile)>) -> L
         for ty in 0..count[1] {
             for tx in 0..count[0] {
                 let key = TileKey { layer: number as u16, level: level as u16, tx, ty };
-                let (entry, tile) = samples.tile(size, tx, ty);
+                let (mut entry, tile) = samples.tile(size, tx, ty);
+                if level > 0 {
+                    // Nobody has measured it.
+                    entry.deviation = f32::INFINITY;
+                }
                 entries.push(entry);
                 if let Some(tile) = tile {
                     tiles.push((key, tile));

@@ -22,10 +22,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use terrafarm_common::id::BlobHash;
 
-/// Steps of a coarser level within one of level 0: what the tent filter of whole steps
-/// needs to be exact.
-const COARSE_STEPS: f64 = 16.0;
-
 /// Why a source cannot give its posts: any error; its text is shown.
 pub type SourceError = Box<dyn std::error::Error + Send + Sync>;
 
@@ -79,7 +75,7 @@ pub struct LayerSpec {
     /// Heights: what every height is a whole multiple of, metres, as the decimal number
     /// that is written (0.1 means one tenth). It makes tiles smaller and is never
     /// enforced: heights that do not fit are kept as they are. Coarser levels are
-    /// rounded to a sixteenth of it.
+    /// rounded as [`crate::rounding`] says.
     pub quantum_m: Option<f32>,
 }
 
@@ -344,8 +340,7 @@ impl StoreBuilder {
         let finest = self.build_finest::<P>(spec.posts, step, source, watch)?;
         layer.levels.push(finest);
         for level in 1..Layer::level_count(spec.posts) {
-            let coarse_step = step.map(|step| step / COARSE_STEPS);
-            let coarser = self.build_coarser::<P>(&layer, level, coarse_step, watch)?;
+            let coarser = self.build_coarser::<P>(&layer, level, watch)?;
             layer.levels.push(coarser);
         }
         Ok(layer)

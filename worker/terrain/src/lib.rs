@@ -4,8 +4,8 @@
 //! in memory and [`codec`] as bytes; [`store`] is the file, [`build`] makes one (with the
 //! coarser levels and their error bounds), [`cache`] keeps blobs of it on a worker's disk,
 //! [`resident`] holds decoded tiles for the ray caster. [`sample`] answers "how high is it
-//! here" and holds the definition of the surface; [`hillshade`] and [`info`] show people
-//! what a store is.
+//! here" and holds the definition of the surface; [`rounding`] has the steps of computed
+//! heights; [`hillshade`] and [`info`] show people what a store is.
 //!
 //! Terminology: a *post* is one sample at a grid point; a *cell* lies between four
 //! posts; a *tile* is [`layout::TILE_CELLS`] cells a side; a *layer* is a pyramid of
@@ -24,6 +24,7 @@ mod planes;
 mod positioned;
 mod pyramid;
 pub mod resident;
+pub mod rounding;
 pub mod sample;
 pub mod store;
 pub mod tile;

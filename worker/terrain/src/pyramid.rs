@@ -15,12 +15,14 @@
 //! coarse one is bilinear on the whole coarse cell), hence so is their difference, and a
 //! bilinear function is largest at a corner. The largest difference at fine posts is
 //! therefore the largest anywhere: exact between neighbouring levels. Added to the
-//! largest deviation of the finer tiles below it bounds the distance to level 0.
+//! largest deviation of the finer tiles below it bounds the distance to level 0. Coarse
+//! posts are rounded (see [`crate::rounding`]) before anything is compared with them.
 
 use crate::build::{LayerSource, SourceError};
 use crate::codec::{self, CodecError};
 use crate::color::{LINEAR_OF_SRGB, srgb_of_linear};
 use crate::layout::{LayerKind, MAX_HEIGHT_M, PostWindow, TILE_CELLS, TILE_POSTS, TILE_RING};
+use crate::rounding::rounded;
 
 /// Fine posts beyond the ground of a row of coarse tiles that their rings depend on: a
 /// ring post is two fine posts out, its tent three.
@@ -124,8 +126,7 @@ impl Post for f32 {
             return f32::NAN;
         }
         let mean = sum / f64::from(weights);
-        let rounded = step_m.map_or(mean, |step| (mean / step).round() * step);
-        (rounded as f32).clamp(-MAX_HEIGHT_M, MAX_HEIGHT_M) + 0.0
+        rounded(mean, step_m).clamp(-MAX_HEIGHT_M, MAX_HEIGHT_M)
     }
 
     fn extent(posts: impl Iterator<Item = f32>) -> (f32, f32) {
@@ -358,14 +359,16 @@ mod tests {
         #[test]
         fn no_point_of_the_coarse_surface_is_further_than_the_deviation(
             width in 2u64..12, height in 2u64..12, seed: u64, holes in 0u64..3,
+            relief in prop::sample::select(vec![1000.0f32, 3.0, 0.05]),
+            step in prop::sample::select(vec![None, Some(1.0 / 64.0), Some(1.0 / 8.0)]),
         ) {
             let value = |i: u64, j: u64| {
                 let mixed = (seed ^ i << 8 ^ j).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
-                if mixed % 16 < holes { f32::NAN } else { (mixed % 1000) as f32 }
+                if mixed % 16 < holes { f32::NAN } else { (mixed % 1000) as f32 * (relief / 1000.0) }
             };
             let grid = [width, height];
             let fine = level(grid, value);
-            let tile = fine.coarse_tile(0, 0, coarse_size(grid), Some(1.0 / 16.0));
+            let tile = fine.coarse_tile(0, 0, coarse_size(grid), step);
             let deviation = fine.deviation(0, 0, &tile);
             let mut largest: f64 = 0.0;
             for step_j in 0..=(height - 1) * 5 {

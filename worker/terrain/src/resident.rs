@@ -246,7 +246,6 @@ mod tests {
     use super::*;
     use crate::fixture::{Ground, height_layer, hills};
     use crate::store::StoreReader;
-    use crate::tile::HEIGHT_TILE_BYTES;
 
     /// All tiles of a store of 3 x 2 tiles (the last one void), one of a photo, and none
     /// of them loaded.
@@ -315,13 +314,14 @@ mod tests {
             resident.insert(*key, tile.clone());
             resident.next_round();
         }
+        let one = tiles[0].1.memory_bytes();
         let snapshot = resident.clone();
         snapshot.touch(keys[0]);
-        assert_eq!(resident.evict_to(5 * HEIGHT_TILE_BYTES), []);
-        assert_eq!(resident.evict_to(3 * HEIGHT_TILE_BYTES), [keys[1], keys[2]]);
+        assert_eq!(resident.evict_to(5 * one), []);
+        assert_eq!(resident.evict_to(3 * one), [keys[1], keys[2]]);
         assert!(matches!(resident.height(keys[1]), Lookup::Absent));
         assert!(matches!(snapshot.height(keys[1]), Lookup::Found(_)), "a snapshot keeps its own");
-        assert_eq!(resident.evict_to(HEIGHT_TILE_BYTES + 1), [keys[3], keys[4]]);
+        assert_eq!(resident.evict_to(one + 1), [keys[3], keys[4]]);
         assert_eq!(resident.evict_to(0), [keys[0]]);
         assert_eq!(resident.bytes(), 0);
     }
@@ -333,6 +333,6 @@ mod tests {
         resident.insert(tiles[1].0, tiles[1].1.clone());
         resident.next_round();
         resident.insert(tiles[0].0, tiles[0].1.clone());
-        assert_eq!(resident.evict_to(HEIGHT_TILE_BYTES), [tiles[1].0]);
+        assert_eq!(resident.evict_to(tiles[0].1.memory_bytes()), [tiles[1].0]);
     }
 }

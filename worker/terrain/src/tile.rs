@@ -2,27 +2,103 @@
 
 use crate::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
 
+mod codes;
+mod maxima;
+
+pub use maxima::{MAXIMA_LEVELS, MAXIMA_START};
+
+use maxima::{MAXIMA_COUNT, Sample, maxima_of};
+
 /// Heights of one tile with the maxima that let a ray skip ground it cannot touch.
 ///
 /// Posts are addressed relative to the tile's south-west post, −1 ..= 257 along each
 /// axis (see [`TILE_RING`]). A void post is NaN.
+///
+/// Kept in two bytes a post where all heights are multiples of one step, which those of
+/// nearly all terrain are; else in four. Either way every post is what was given, to the
+/// bit.
 pub struct HeightTile {
-    posts: Box<[f32]>,
-    /// Maxima over blocks of 2, 4, ... 256 cells a side, finest first, row-major: over
-    /// the corners of the valid cells in the block; −infinity where none is valid.
-    maxima: [Box<[f32]>; MAXIMA_LEVELS],
+    kept: Kept,
     has_voids: bool,
 }
 
-/// Number of levels of maxima within a tile: blocks of 2^1 ..= 2^8 cells.
-pub const MAXIMA_LEVELS: usize = TILE_CELLS.ilog2() as usize;
+enum Kept {
+    Codes { posts: Box<[u16]>, maxima: Box<[u16]>, base: i32, step: f64 },
+    Floats { posts: Box<[f32]>, maxima: Box<[f32]> },
+}
 
-/// Bytes of a [`HeightTile`] in memory: posts, and a third of them for the maxima.
-pub const HEIGHT_TILE_BYTES: usize = size_of::<HeightTile>()
-    + size_of::<f32>() * (TILE_POSTS * TILE_POSTS + (TILE_CELLS * TILE_CELLS - 1) / 3);
+/// The code of a void post.
+pub const VOID: u16 = u16::MAX;
+
+/// The arrays of a tile as the kernels read them.
+///
+/// In both forms the posts are row-major from the south-west, ring included,
+/// [`TILE_POSTS`] a row; the maxima of all levels follow one another from
+/// [`MAXIMA_START`]. Each array has one element more at its end, so that a load of two
+/// elements at the last one stays inside.
+#[derive(Debug, Clone, Copy)]
+pub enum Heights<'a> {
+    /// Two bytes a post.
+    Codes(Codes<'a>),
+    /// Four bytes a post.
+    Floats(Floats<'a>),
+}
+
+/// Heights as multiples of a step: a post is
+/// `(f64::from(base + i32::from(code)) * step) as f32` metres, a code of 1 to 65534 the
+/// higher, the higher it is.
+#[derive(Debug, Clone, Copy)]
+pub struct Codes<'a> {
+    /// Codes of the posts; [`VOID`] for a void.
+    pub posts: &'a [u16],
+    /// Codes of the maxima; 0, which is below every post, where no cell is valid.
+    pub maxima: &'a [u16],
+    /// Steps to code 0. Base plus any code is an i32.
+    pub base: i32,
+    /// The step, metres.
+    pub step: f64,
+}
+
+/// Heights as they are, metres.
+#[derive(Debug, Clone, Copy)]
+pub struct Floats<'a> {
+    /// The posts; NaN for a void.
+    pub posts: &'a [f32],
+    /// The maxima; −infinity where no cell is valid.
+    pub maxima: &'a [f32],
+}
+
+impl Codes<'_> {
+    /// Height of a code, metres; NaN for [`VOID`].
+    #[inline(always)]
+    pub fn height(&self, code: u16) -> f32 {
+        if code == VOID { f32::NAN } else { codes::height(self.base, self.step, code) }
+    }
+}
+
+/// Bytes of the largest [`HeightTile`] in memory: one with four bytes a post, and a third
+/// of the posts for the maxima.
+pub const HEIGHT_TILE_BYTES: usize =
+    size_of::<HeightTile>() + size_of::<f32>() * (TILE_POSTS * TILE_POSTS + MAXIMA_COUNT + 2);
 /// Bytes of a [`PhotoTile`] in memory.
 pub const PHOTO_TILE_BYTES: usize =
     size_of::<PhotoTile>() + size_of::<[u16; 4]>() * TILE_POSTS * TILE_POSTS;
+
+impl Sample for u16 {
+    const NOTHING: u16 = 0;
+
+    fn is_void(self) -> bool {
+        self == VOID
+    }
+}
+
+impl Sample for f32 {
+    const NOTHING: f32 = f32::NEG_INFINITY;
+
+    fn is_void(self) -> bool {
+        self.is_nan()
+    }
+}
 
 impl HeightTile {
     /// A tile from its posts, row by row from the south-west, ring included.
@@ -32,9 +108,33 @@ impl HeightTile {
             return None;
         }
         let has_voids = posts.iter().any(|height| height.is_nan());
-        let mut tile = HeightTile { posts, maxima: Default::default(), has_voids };
-        tile.build_maxima();
-        Some(tile)
+        let kept = match codes::coded(&posts) {
+            Some(coded) => Kept::Codes {
+                maxima: maxima_of(&coded.posts, has_voids),
+                posts: coded.posts,
+                base: coded.base,
+                step: coded.step,
+            },
+            None => {
+                let mut padded = Vec::with_capacity(posts.len() + 1);
+                padded.extend_from_slice(&posts);
+                padded.push(f32::NAN);
+                let maxima = maxima_of(&posts, has_voids);
+                Kept::Floats { maxima, posts: padded.into_boxed_slice() }
+            }
+        };
+        Some(HeightTile { kept, has_voids })
+    }
+
+    /// The arrays of the tile.
+    #[inline(always)]
+    pub fn heights(&self) -> Heights<'_> {
+        match &self.kept {
+            Kept::Codes { posts, maxima, base, step } => {
+                Heights::Codes(Codes { posts, maxima, base: *base, step: *step })
+            }
+            Kept::Floats { posts, maxima } => Heights::Floats(Floats { posts, maxima }),
+        }
     }
 
     /// Height of a post, metres; NaN for a void. `i` and `j` from −1 to 257.
@@ -42,7 +142,11 @@ impl HeightTile {
     pub fn post(&self, i: isize, j: isize) -> f32 {
         let column = (i + TILE_RING as isize) as usize;
         let row = (j + TILE_RING as isize) as usize;
-        self.posts[row * TILE_POSTS + column]
+        let at = row * TILE_POSTS + column;
+        match self.heights() {
+            Heights::Codes(codes) => codes.height(codes.posts[at]),
+            Heights::Floats(floats) => floats.posts[at],
+        }
     }
 
     /// The corners of a cell: south-west, south-east, north-west, north-east.
@@ -50,15 +154,31 @@ impl HeightTile {
     #[inline]
     pub fn corners(&self, i: usize, j: usize) -> [f32; 4] {
         let at = (j + TILE_RING) * TILE_POSTS + i + TILE_RING;
-        let posts = &self.posts[at..at + TILE_POSTS + 2];
-        [posts[0], posts[1], posts[TILE_POSTS], posts[TILE_POSTS + 1]]
+        match self.heights() {
+            Heights::Codes(codes) => {
+                let posts = &codes.posts[at..at + TILE_POSTS + 2];
+                [posts[0], posts[1], posts[TILE_POSTS], posts[TILE_POSTS + 1]]
+                    .map(|code| codes.height(code))
+            }
+            Heights::Floats(floats) => {
+                let posts = &floats.posts[at..at + TILE_POSTS + 2];
+                [posts[0], posts[1], posts[TILE_POSTS], posts[TILE_POSTS + 1]]
+            }
+        }
     }
 
     /// Highest corner of the valid cells in a block of `1 << level` cells a side, level 1
     /// to 8; block (0, 0) is the south-west one. −infinity where no cell is valid.
     #[inline]
     pub fn block_max(&self, level: usize, bi: usize, bj: usize) -> f32 {
-        self.maxima[level - 1][bj * (TILE_CELLS >> level) + bi]
+        let at = MAXIMA_START[level] + bj * (TILE_CELLS >> level) + bi;
+        match self.heights() {
+            Heights::Codes(codes) => match codes.maxima[at] {
+                u16::NOTHING => f32::NEG_INFINITY,
+                code => codes.height(code),
+            },
+            Heights::Floats(floats) => floats.maxima[at],
+        }
     }
 
     /// Whether any post of the tile, ring included, is void.
@@ -67,76 +187,24 @@ impl HeightTile {
     }
 
     /// All posts, row by row from the south-west, ring included.
-    pub fn posts(&self) -> &[f32] {
-        &self.posts
+    pub fn to_posts(&self) -> Box<[f32]> {
+        let count = TILE_POSTS * TILE_POSTS;
+        match self.heights() {
+            Heights::Codes(codes) => {
+                codes.posts[..count].iter().map(|&code| codes.height(code)).collect()
+            }
+            Heights::Floats(floats) => floats.posts[..count].into(),
+        }
     }
 
     /// Bytes this tile takes in memory.
     pub fn memory_bytes(&self) -> usize {
-        let floats = self.posts.len() + self.maxima.iter().map(|level| level.len()).sum::<usize>();
-        floats * size_of::<f32>() + size_of::<Self>()
-    }
-
-    fn build_maxima(&mut self) {
-        self.maxima[0] =
-            if self.has_voids { self.finest_maxima_with_voids() } else { self.finest_maxima() };
-        for level in 1..MAXIMA_LEVELS {
-            let side = TILE_CELLS >> (level + 1);
-            let finer = &self.maxima[level - 1];
-            let mut blocks = Vec::with_capacity(side * side);
-            for rows in finer.chunks_exact(4 * side) {
-                let (south, north) = rows.split_at(2 * side);
-                let pairs = south.chunks_exact(2).zip(north.chunks_exact(2));
-                blocks
-                    .extend(pairs.map(|(s, n)| greater(greater(s[0], s[1]), greater(n[0], n[1]))));
-            }
-            self.maxima[level] = blocks.into_boxed_slice();
-        }
-    }
-
-    /// Maxima over 2 x 2 cells: of the nine posts, where all are valid.
-    fn finest_maxima(&self) -> Box<[f32]> {
-        let side = TILE_CELLS / 2;
-        let mut blocks = Vec::with_capacity(side * side);
-        for bj in 0..side {
-            let row = |j: usize| {
-                let start = (2 * bj + j + TILE_RING) * TILE_POSTS + TILE_RING;
-                &self.posts[start..start + TILE_CELLS + 1]
-            };
-            let (a, b, c) = (row(0), row(1), row(2));
-            let highest = |i: usize| greater(greater(a[i], b[i]), c[i]);
-            blocks.extend((0..side).map(|bi| {
-                greater(greater(highest(2 * bi), highest(2 * bi + 1)), highest(2 * bi + 2))
-            }));
-        }
-        blocks.into_boxed_slice()
-    }
-
-    /// The same with void posts: only the corners of valid cells count.
-    fn finest_maxima_with_voids(&self) -> Box<[f32]> {
-        let cell_max = |i: usize, j: usize| {
-            let corners = self.corners(i, j);
-            if corners.iter().any(|height| height.is_nan()) {
-                f32::NEG_INFINITY
-            } else {
-                corners.into_iter().fold(f32::NEG_INFINITY, greater)
-            }
+        let arrays = match self.heights() {
+            Heights::Codes(codes) => size_of_val(codes.posts) + size_of_val(codes.maxima),
+            Heights::Floats(floats) => size_of_val(floats.posts) + size_of_val(floats.maxima),
         };
-        let side = TILE_CELLS / 2;
-        let blocks = (0..side * side).map(|at| {
-            let (i, j) = (2 * (at % side), 2 * (at / side));
-            let cells =
-                [cell_max(i, j), cell_max(i + 1, j), cell_max(i, j + 1), cell_max(i + 1, j + 1)];
-            cells.into_iter().fold(f32::NEG_INFINITY, greater)
-        });
-        blocks.collect()
+        arrays + size_of::<Self>()
     }
-}
-
-/// The greater of two numbers, neither of them NaN: one instruction, unlike `f32::max`.
-#[inline]
-fn greater(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
 }
 
 /// Colours of one tile of a photo, ready to be filtered: linear light, premultiplied by
@@ -170,6 +238,7 @@ impl PhotoTile {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use proptest::prelude::*;
 
     fn tile(rule: impl Fn(isize, isize) -> f32) -> HeightTile {
         let side = TILE_POSTS as isize;
@@ -183,7 +252,6 @@ mod tests {
         assert_eq!(tile.post(-1, -1), -1001.0);
         assert_eq!(tile.post(257, 257), 257_257.0);
         assert_eq!(tile.corners(255, 0), [255.0, 256.0, 1255.0, 1256.0]);
-        assert_eq!(tile.memory_bytes(), HEIGHT_TILE_BYTES);
         let photo = PhotoTile::new(vec![[0; 4]; TILE_POSTS * TILE_POSTS].into()).unwrap();
         assert_eq!(photo.memory_bytes(), PHOTO_TILE_BYTES);
     }
@@ -193,8 +261,10 @@ mod tests {
         let rough = |i: isize, j: isize| ((i * 7919 + j * 104_729) % 1009) as f32 - 300.0;
         let holed = |i: isize, j: isize| if (i * j) % 97 == 5 { f32::NAN } else { rough(i, j) };
         assert!(!tile(rough).has_voids() && tile(holed).has_voids());
-        check_maxima(&tile(rough));
-        check_maxima(&tile(holed));
+        for scale in [1.0, 0.1, 0.123_456_7] {
+            check_maxima(&tile(|i, j| rough(i, j) * scale));
+            check_maxima(&tile(|i, j| holed(i, j) * scale));
+        }
         check_maxima(&tile(|_, _| f32::NAN));
     }
 
@@ -221,5 +291,110 @@ mod tests {
     fn a_wrong_number_of_posts_is_no_tile() {
         assert!(HeightTile::new(vec![0.0; 10].into()).is_none());
         assert!(PhotoTile::new(vec![[0; 4]; 10].into()).is_none());
+    }
+
+    #[test]
+    fn levels_of_maxima_follow_one_another() {
+        assert_eq!(MAXIMA_START[1..4], [0, 128 * 128, 128 * 128 + 64 * 64]);
+        assert_eq!(MAXIMA_START[MAXIMA_LEVELS] + 1, (TILE_CELLS * TILE_CELLS - 1) / 3);
+    }
+
+    #[test]
+    fn whole_metres_take_two_bytes_a_post_and_rough_floats_four() {
+        let elements = TILE_POSTS * TILE_POSTS + 1 + (TILE_CELLS * TILE_CELLS - 1) / 3 + 1;
+        let codes = tile(|i, j| (i * j % 5000) as f32);
+        let own = size_of::<HeightTile>();
+        assert_eq!(codes.memory_bytes(), 2 * elements + own);
+        let floats = tile(|i, j| libm::sqrtf((i + j + 2) as f32));
+        assert_eq!(floats.memory_bytes(), 4 * elements + own);
+        assert_eq!(floats.memory_bytes(), HEIGHT_TILE_BYTES);
+        let per_cell = codes.memory_bytes() as f64 / (TILE_CELLS * TILE_CELLS) as f64;
+        assert!(per_cell * 4.0 / 3.0 < 3.7, "with all coarser levels: {per_cell}");
+    }
+
+    /// What kernels rely on: lengths, pads, and that codes say what `post` says.
+    #[track_caller]
+    fn check_arrays(tile: &HeightTile) {
+        let (posts, maxima) = match tile.heights() {
+            Heights::Codes(codes) => {
+                assert!(codes.base.checked_add(i32::from(VOID)).is_some());
+                assert!(codes.posts.iter().all(|&code| code > 0), "0 is no post");
+                assert!(codes.maxima.iter().all(|&code| code < VOID), "no maximum is void");
+                assert_eq!(codes.posts.last(), Some(&VOID));
+                (codes.posts.len(), codes.maxima.len())
+            }
+            Heights::Floats(floats) => {
+                assert!(floats.maxima.iter().all(|max| !max.is_nan()));
+                assert!(floats.posts.last().unwrap().is_nan());
+                (floats.posts.len(), floats.maxima.len())
+            }
+        };
+        assert_eq!(posts, TILE_POSTS * TILE_POSTS + 1);
+        assert_eq!(maxima, MAXIMA_START[MAXIMA_LEVELS] + 2);
+    }
+
+    /// The bits of a post; all voids are the same.
+    fn bits(post: f32) -> u32 {
+        if post.is_nan() { f32::NAN.to_bits() } else { post.to_bits() }
+    }
+
+    /// Rules that make a height of a random number.
+    fn rules() -> impl Strategy<Value = (&'static str, fn(u32) -> f32)> {
+        prop::sample::select(vec![
+            ("whole", (|n| (n % 9000) as f32 - 400.0) as fn(u32) -> f32),
+            ("tenths", |n| (f64::from(n % 60_000) * 0.1 - 500.0) as f32),
+            ("hundredths", |n| (f64::from(n % 60_000) * 0.01) as f32),
+            ("feet", |n| (f64::from(n % 30_000) * 0.3048) as f32),
+            ("sixty-fourths", |n| (n % 65_000) as f32 / 64.0 - 800.0),
+            ("a fine step over more than its codes", |n| (n % 70_000) as f32 / 1024.0),
+            ("any number", f32::from_bits),
+            ("near a million", |n| 1e6 + (n % 1000) as f32 * 0.0625),
+            ("all equal", |_| 1234.567),
+            ("zeros of both signs", |n| if n % 1000 == 0 { -0.0 } else { 0.0 }),
+            ("all void", |_| f32::NAN),
+        ])
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+
+        #[test]
+        fn every_post_comes_back_bit_for_bit((name, rule) in rules(), seed: u32, holes in 0u32..4) {
+            let noise = |i: isize, j: isize| {
+                let mixed = (i as u32).wrapping_mul(0x9e37_79b9) ^ (j as u32).wrapping_mul(0x85eb_ca6b);
+                (mixed ^ seed).wrapping_mul(0xc2b2_ae35) ^ mixed >> 15
+            };
+            let height = |i: isize, j: isize| {
+                let n = noise(i, j);
+                if n >> 8 & 15 < holes { f32::NAN } else { rule(n) }
+            };
+            let tile = tile(height);
+            check_arrays(&tile);
+            let posts = tile.to_posts();
+            prop_assert_eq!(posts.len(), TILE_POSTS * TILE_POSTS);
+            for (at, &post) in posts.iter().enumerate() {
+                let (i, j) = ((at % TILE_POSTS) as isize - 1, (at / TILE_POSTS) as isize - 1);
+                prop_assert_eq!(bits(post), bits(height(i, j)), "{}", name);
+                prop_assert_eq!(bits(post), bits(tile.post(i, j)));
+            }
+            for (i, j) in [(0, 0), (255, 255), (17, 200)] {
+                let corners = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)];
+                let expected = corners.map(|(i, j)| bits(height(i, j)));
+                prop_assert_eq!(tile.corners(i as usize, j as usize).map(bits), expected);
+            }
+        }
+    }
+
+    #[test]
+    fn common_heights_have_codes() {
+        let has_codes = |rule: fn(isize) -> f32| {
+            matches!(tile(|i, j| rule(i * 7 + j)).heights(), Heights::Codes(_))
+        };
+        assert!(has_codes(|n| n as f32));
+        assert!(has_codes(|n| (n as f64 * 0.1) as f32));
+        assert!(has_codes(|n| (n as f64 * 0.3048) as f32));
+        assert!(has_codes(|n| n as f32 / 64.0));
+        assert!(has_codes(|_| f32::NAN));
+        assert!(!has_codes(|n| n as f32 * 0.123_456_7));
     }
 }

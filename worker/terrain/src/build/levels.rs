@@ -7,6 +7,7 @@ use crate::layout::{
 };
 use crate::positioned::read_exact_at;
 use crate::pyramid::{FINE_REACH, FinePosts, Post, post_in_tile};
+use crate::rounding;
 use crate::store::hash_of;
 use rayon::prelude::*;
 
@@ -55,10 +56,10 @@ impl StoreBuilder {
         &mut self,
         layer: &Layer,
         level: usize,
-        step: Option<f64>,
         watch: &mut Watch<'_>,
     ) -> Result<Level, BuildError> {
         let posts = layer.level_posts(level);
+        let step = rounding::step_m(layer.level_spacing(level));
         let tiles = Layer::tiles_for(posts);
         let mut entries = Vec::with_capacity(tiles[0] as usize * tiles[1] as usize);
         for ty in 0..tiles[1] {
@@ -70,7 +71,7 @@ impl StoreBuilder {
                     .map(|tx| {
                         let tile = fine.coarse_tile(tx, ty, posts, step);
                         let below = deviation_below(layer, level - 1, tx, ty);
-                        make(&tile, step, 0, || round_up(fine.deviation(tx, ty, &tile) + below))
+                        make(&tile, None, 0, || round_up(fine.deviation(tx, ty, &tile) + below))
                     })
                     .collect();
                 self.append(made, &mut entries, watch)?;

@@ -28,6 +28,7 @@ use rayon::prelude::*;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use surface::Surface;
+use terrafarm_terrain::rounding;
 
 /// The largest number of posts a side.
 pub const MAX_POSTS: u32 = 65_537;
@@ -35,8 +36,9 @@ pub const MAX_POSTS: u32 = 65_537;
 pub const MAX_PHOTO_SCALE: u32 = 4;
 /// The largest side of the macro map, cells.
 pub const MACRO_SIDE: usize = 1025;
-/// Heights are multiples of this, metres: an exact power of two.
-pub const HEIGHT_QUANTUM_M: f32 = 1.0 / 32.0;
+
+/// The step of heights that [`rounding`] would leave as they are, metres.
+const FINEST_STEP_M: f64 = 1.0 / 1024.0;
 
 /// What terrain to make.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -103,6 +105,11 @@ impl SynthSpec {
     /// Length of a side, metres.
     pub fn extent_m(&self) -> f64 {
         f64::from(self.posts - 1) * self.spacing_m
+    }
+
+    /// What all heights are multiples of, metres: a power of two.
+    pub fn height_step_m(&self) -> f32 {
+        rounding::step_m([self.spacing_m; 2]).unwrap_or(FINEST_STEP_M) as f32
     }
 
     /// Photo pixels along a side: the first and the last lie on the outermost posts.

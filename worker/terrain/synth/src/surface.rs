@@ -3,7 +3,7 @@
 use crate::grid::Sample;
 use crate::landscape::Landscape;
 use crate::noise::{Noise, mix, smoothstep};
-use crate::{HEIGHT_QUANTUM_M, SynthSpec};
+use crate::SynthSpec;
 
 /// The longest wavelength of added detail, cells of the macro map.
 const DETAIL_CELLS: f32 = 4.5;
@@ -28,6 +28,7 @@ pub(crate) struct Surface {
     pub landscape: Landscape,
     pub seed: u64,
     pub spacing_m: f64,
+    height_step_m: f32,
     wavelengths_m: Vec<f32>,
     warp: Noise,
     ribs: Noise,
@@ -48,6 +49,7 @@ impl Surface {
             landscape,
             seed: spec.seed,
             spacing_m: spec.spacing_m,
+            height_step_m: spec.height_step_m(),
             wavelengths_m,
             warp: Noise::new(spec.seed, 20),
             ribs: Noise::new(spec.seed, 21),
@@ -70,11 +72,12 @@ impl Surface {
         let level = self.landscape.level.at((u + 0.5).floor() as i64, (v + 0.5).floor() as i64);
         let calm = self.calm(sample.value, level, u, v);
         let height = sample.value + self.detail(&sample, x, y, u, v, calm);
+        let in_steps =
+            |height: f32| (height / self.height_step_m + 0.5).floor() * self.height_step_m;
         if height < level {
-            return Ground { height: level, depth: level - height, u, v };
+            return Ground { height: in_steps(level), depth: level - height, u, v };
         }
-        let steps = (height / HEIGHT_QUANTUM_M + 0.5).floor();
-        Ground { height: steps * HEIGHT_QUANTUM_M, depth: 0.0, u, v }
+        Ground { height: in_steps(height), depth: 0.0, u, v }
     }
 
     /// How much of the detail a place may have: none at shores and in river beds.

@@ -1,12 +1,13 @@
 //! A terrain from a seed as a store on disk.
 
-use crate::{HEIGHT_QUANTUM_M, Synth, SynthError, SynthSpec, synthesize};
+use crate::{Synth, SynthError, SynthSpec, synthesize};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use terrafarm_terrain::build::{
     BuildError, LayerSource, LayerSpec, SourceError, StoreBuilder, StoreSummary,
 };
 use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::rounding;
 
 /// Share of the work that shaping the land takes; the rest is tiles.
 const SHAPING: f32 = 0.4;
@@ -64,7 +65,7 @@ pub fn write_store(
     let synth = synthesize(spec, &|share| progress(share * SHAPING), cancel)?;
     let side = |posts: u32| [u64::from(posts); 2];
     let layers = [
-        (LayerKind::Height, spec.posts, spec.spacing_m, Some(HEIGHT_QUANTUM_M)),
+        (LayerKind::Height, spec.posts, spec.spacing_m, Some(spec.height_step_m())),
         (LayerKind::Photo, spec.photo_side(), spec.spacing_m / f64::from(spec.photo_scale), None),
     ];
     // A photo has more to paint than a height layer has to compute.
@@ -86,8 +87,11 @@ pub fn write_store(
     }
     let report = ImportReport {
         inputs: vec![format!(
-            "procedural: {0} x {0} posts, {1} m apart, seed {2}",
-            spec.posts, spec.spacing_m, spec.seed
+            "procedural: {0} x {0} posts, {1} m apart, seed {2}, heights in steps of {3}",
+            spec.posts,
+            spec.spacing_m,
+            spec.seed,
+            rounding::in_words(spec.height_step_m().into())
         )],
         made_by: concat!("terrafarm ", env!("CARGO_PKG_VERSION")).into(),
         ..ImportReport::default()

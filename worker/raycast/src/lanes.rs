@@ -1,0 +1,183 @@
+//! Several rays at once: vectors of f32 and i32, one kernel for every width.
+//!
+//! A kernel is written once, over [`Lanes`]. [`One`] is its scalar twin; `Eight` needs
+//! AVX2 and `Sixteen` AVX-512. All do the same IEEE operations on each lane, none fuses a
+//! multiplication with an addition, and no lane looks at another, so a lane's result does
+//! not depend on the width. Which width runs is chosen once per render call, by
+//! [`widest`].
+//!
+//! Kernels are `#[inline(always)]` down to a single function per width that carries the
+//! target feature: whatever is not inlined into it would be compiled without.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod one;
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) use avx2::Eight;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use avx512::Sixteen;
+pub(crate) use one::One;
+
+use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
+use std::sync::OnceLock;
+
+/// A width: the types of its vectors.
+pub(crate) trait Lanes: Copy + 'static {
+    /// Lanes of a vector.
+    const N: usize;
+    type F: Floats<I = Self::I, M = Self::M>;
+    type I: Ints<F = Self::F, M = Self::M>;
+    type M: Mask;
+}
+
+/// One f32 a lane.
+pub(crate) trait Floats:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Neg<Output = Self>
+{
+    type I;
+    type M;
+    fn splat(value: f32) -> Self;
+    /// The first N values of a slice; panics if there are fewer.
+    fn load(values: &[f32]) -> Self;
+    /// Into the first N places of a slice; panics if there are fewer.
+    fn store(self, values: &mut [f32]);
+    fn div(self, by: Self) -> Self;
+    fn sqrt(self) -> Self;
+    /// The lesser; `other` if either is NaN.
+    fn min(self, other: Self) -> Self;
+    /// The greater; `other` if either is NaN.
+    fn max(self, other: Self) -> Self;
+    fn abs(self) -> Self;
+    fn lt(self, other: Self) -> Self::M;
+    fn le(self, other: Self) -> Self::M;
+    fn select(mask: Self::M, yes: Self, no: Self) -> Self;
+    /// Towards zero; beyond the range of i32 and for NaN, `i32::MIN`.
+    fn truncate(self) -> Self::I;
+    /// The greatest integer that is not above, for values within the range of i32.
+    fn floor(self) -> Self::I;
+    /// The same bits.
+    fn from_bits(bits: Self::I) -> Self;
+    /// Each lane in `mask` into its element of a table. An index outside the table writes
+    /// to its end.
+    fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
+}
+
+/// One i32 a lane; arithmetic wraps.
+pub(crate) trait Ints:
+    Copy + Add<Output = Self> + Sub<Output = Self> + BitAnd<Output = Self>
+{
+    type F;
+    type M;
+    fn splat(value: i32) -> Self;
+    fn load(values: &[i32]) -> Self;
+    fn store(self, values: &mut [i32]);
+    /// The nearest f32.
+    fn to_floats(self) -> Self::F;
+    /// Each lane shifted by the other's lane, 0 to 31, with its sign.
+    fn shr(self, by: Self) -> Self;
+    fn shl(self, by: Self) -> Self;
+    /// The low half of each product.
+    fn times(self, by: Self) -> Self;
+    fn min(self, other: Self) -> Self;
+    fn max(self, other: Self) -> Self;
+    fn eq(self, other: Self) -> Self::M;
+    fn lt(self, other: Self) -> Self::M;
+    fn select(mask: Self::M, yes: Self, no: Self) -> Self;
+    /// For each lane in `mask` the elements `at` (low half) and `at + 1` (high half) of a
+    /// table of at least two; lanes outside get 0. An index outside the table reads from
+    /// its end.
+    fn gather_pairs(table: &[u16], at: Self, mask: Self::M) -> Self;
+    /// The same for single elements of 32 bits.
+    fn gather(table: &[u32], at: Self, mask: Self::M) -> Self;
+}
+
+/// A yes or no a lane.
+pub(crate) trait Mask:
+    Copy + BitAnd<Output = Self> + BitOr<Output = Self> + Not<Output = Self>
+{
+    fn none() -> Self;
+    /// Bit n is lane n.
+    fn bits(self) -> u32;
+    fn from_bits(bits: u32) -> Self;
+    #[inline(always)]
+    fn any(self) -> bool {
+        self.bits() != 0
+    }
+    #[inline(always)]
+    fn count(self) -> u32 {
+        self.bits().count_ones()
+    }
+}
+
+/// The widths that a processor may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Width {
+    /// Plain code, everywhere.
+    One,
+    /// AVX2.
+    Eight,
+    /// AVX-512 (F, BW, DQ, VL).
+    Sixteen,
+}
+
+impl Width {
+    /// Every width that this processor has, narrowest first.
+    pub fn available() -> Vec<Width> {
+        let mut widths = vec![Width::One];
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::arch::is_x86_feature_detected!("avx2") {
+                widths.push(Width::Eight);
+            }
+            let wide = std::arch::is_x86_feature_detected!("avx512f")
+                && std::arch::is_x86_feature_detected!("avx512bw")
+                && std::arch::is_x86_feature_detected!("avx512dq")
+                && std::arch::is_x86_feature_detected!("avx512vl");
+            if wide && widths.contains(&Width::Eight) {
+                widths.push(Width::Sixteen);
+            }
+        }
+        widths
+    }
+
+    /// The name that reports use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Width::One => "scalar",
+            Width::Eight => "avx2",
+            Width::Sixteen => "avx512",
+        }
+    }
+}
+
+/// The widest that this processor has.
+pub(crate) fn widest() -> Width {
+    static WIDEST: OnceLock<Width> = OnceLock::new();
+    *WIDEST.get_or_init(|| Width::available().pop().unwrap_or(Width::One))
+}
+
+/// Work that is written for any width.
+pub(crate) trait Kernel {
+    type Output;
+    /// Must be `#[inline(always)]`, as all that it calls in its loops.
+    fn run<L: Lanes>(self) -> Self::Output;
+}
+
+/// Runs a kernel at a width that [`Width::available`] has named.
+pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
+    match width {
+        Width::One => kernel.run::<One>(),
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: the caller has the width from `Width::available`.
+        Width::Eight => unsafe { avx2::run(kernel) },
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: as above.
+        Width::Sixteen => unsafe { avx512::run(kernel) },
+        #[cfg(not(target_arch = "x86_64"))]
+        _ => kernel.run::<One>(),
+    }
+}
+

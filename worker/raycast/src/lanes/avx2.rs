@@ -1,0 +1,241 @@
+//! Eight lanes, with AVX2.
+//!
+//! SAFETY of every block: the intrinsics need AVX2, and vectors of this width are made
+//! only below [`run`], whose caller has seen that the processor has it. Loads and stores
+//! take slices that were checked to be long enough, gathers indices that were brought
+//! inside their table.
+
+use super::{Floats, Ints, Kernel, Lanes, Mask};
+use std::arch::x86_64::*;
+use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
+
+#[derive(Clone, Copy)]
+pub(crate) struct Eight;
+
+#[derive(Clone, Copy)]
+pub(crate) struct F(__m256);
+#[derive(Clone, Copy)]
+pub(crate) struct I(__m256i);
+/// All bits of a lane, or none.
+#[derive(Clone, Copy)]
+pub(crate) struct M(__m256);
+
+impl Lanes for Eight {
+    const N: usize = 8;
+    type F = F;
+    type I = I;
+    type M = M;
+}
+
+/// # Safety
+/// The processor must have AVX2.
+#[target_feature(enable = "avx2,popcnt,bmi1,bmi2,lzcnt")]
+pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<Eight>()
+}
+
+macro_rules! operator {
+    ($type:ident, $trait:ident, $name:ident, $intrinsic:ident) => {
+        impl $trait for $type {
+            type Output = $type;
+            #[inline(always)]
+            fn $name(self, other: $type) -> $type {
+                // SAFETY: see the page of this module.
+                unsafe { $type($intrinsic(self.0, other.0)) }
+            }
+        }
+    };
+}
+
+operator!(F, Add, add, _mm256_add_ps);
+operator!(F, Sub, sub, _mm256_sub_ps);
+operator!(F, Mul, mul, _mm256_mul_ps);
+operator!(I, Add, add, _mm256_add_epi32);
+operator!(I, Sub, sub, _mm256_sub_epi32);
+operator!(I, BitAnd, bitand, _mm256_and_si256);
+operator!(M, BitAnd, bitand, _mm256_and_ps);
+operator!(M, BitOr, bitor, _mm256_or_ps);
+
+impl Neg for F {
+    type Output = F;
+    #[inline(always)]
+    fn neg(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_xor_ps(self.0, _mm256_set1_ps(-0.0))) }
+    }
+}
+
+impl Not for M {
+    type Output = M;
+    #[inline(always)]
+    fn not(self) -> M {
+        // SAFETY: see the page of this module.
+        unsafe { M(_mm256_xor_ps(self.0, _mm256_castsi256_ps(_mm256_set1_epi32(-1)))) }
+    }
+}
+
+macro_rules! binary {
+    ($name:ident, $result:ident, $intrinsic:ident $(, $constant:ident)?) => {
+        #[inline(always)]
+        fn $name(self, other: Self) -> $result {
+            // SAFETY: see the page of this module.
+            unsafe { $result($intrinsic $(::<$constant>)? (self.0, other.0)) }
+        }
+    };
+}
+
+impl Floats for F {
+    type I = I;
+    type M = M;
+    #[inline(always)]
+    fn splat(value: f32) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_set1_ps(value)) }
+    }
+    #[inline(always)]
+    fn load(values: &[f32]) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_loadu_ps(values[..8].as_ptr())) }
+    }
+    #[inline(always)]
+    fn store(self, values: &mut [f32]) {
+        // SAFETY: see the page of this module.
+        unsafe { _mm256_storeu_ps(values[..8].as_mut_ptr(), self.0) }
+    }
+    binary!(div, F, _mm256_div_ps);
+    #[inline(always)]
+    fn sqrt(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_sqrt_ps(self.0)) }
+    }
+    binary!(min, F, _mm256_min_ps);
+    binary!(max, F, _mm256_max_ps);
+    #[inline(always)]
+    fn abs(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0)) }
+    }
+    binary!(lt, M, _mm256_cmp_ps, _CMP_LT_OQ);
+    binary!(le, M, _mm256_cmp_ps, _CMP_LE_OQ);
+    #[inline(always)]
+    fn select(mask: M, yes: F, no: F) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_blendv_ps(no.0, yes.0, mask.0)) }
+    }
+    #[inline(always)]
+    fn truncate(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_cvttps_epi32(self.0)) }
+    }
+    #[inline(always)]
+    fn floor(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_cvttps_epi32(_mm256_floor_ps(self.0))) }
+    }
+    #[inline(always)]
+    fn from_bits(bits: I) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_castsi256_ps(bits.0)) }
+    }
+    #[inline(always)]
+    fn scatter(self, table: &mut [f32], at: I, mask: M) {
+        let (mut values, mut places) = ([0.0; 8], [0; 8]);
+        self.store(&mut values);
+        at.store(&mut places);
+        let (mut bits, last) = (mask.bits(), table.len() - 1);
+        while bits != 0 {
+            let lane = (bits.trailing_zeros() & 7) as usize;
+            table[(places[lane] as u32 as usize).min(last)] = values[lane];
+            bits &= bits - 1;
+        }
+    }
+}
+
+impl Ints for I {
+    type F = F;
+    type M = M;
+    #[inline(always)]
+    fn splat(value: i32) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_set1_epi32(value)) }
+    }
+    #[inline(always)]
+    fn load(values: &[i32]) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_loadu_si256(values[..8].as_ptr().cast())) }
+    }
+    #[inline(always)]
+    fn store(self, values: &mut [i32]) {
+        // SAFETY: see the page of this module.
+        unsafe { _mm256_storeu_si256(values[..8].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn to_floats(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_cvtepi32_ps(self.0)) }
+    }
+    binary!(shr, I, _mm256_srav_epi32);
+    binary!(shl, I, _mm256_sllv_epi32);
+    binary!(times, I, _mm256_mullo_epi32);
+    binary!(min, I, _mm256_min_epi32);
+    binary!(max, I, _mm256_max_epi32);
+    #[inline(always)]
+    fn eq(self, other: I) -> M {
+        // SAFETY: see the page of this module.
+        unsafe { M(_mm256_castsi256_ps(_mm256_cmpeq_epi32(self.0, other.0))) }
+    }
+    #[inline(always)]
+    fn lt(self, other: I) -> M {
+        // SAFETY: see the page of this module.
+        unsafe { M(_mm256_castsi256_ps(_mm256_cmpgt_epi32(other.0, self.0))) }
+    }
+    #[inline(always)]
+    fn select(mask: M, yes: I, no: I) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_blendv_epi8(no.0, yes.0, _mm256_castps_si256(mask.0))) }
+    }
+    #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+            let none = _mm256_setzero_si256();
+            let mask = _mm256_castps_si256(mask.0);
+            I(_mm256_mask_i32gather_epi32::<2>(none, table.as_ptr().cast(), at, mask))
+        }
+    }
+    #[inline(always)]
+    fn gather(table: &[u32], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 1) as i32;
+        // SAFETY: see the page of this module.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+            let none = _mm256_setzero_si256();
+            let mask = _mm256_castps_si256(mask.0);
+            I(_mm256_mask_i32gather_epi32::<4>(none, table.as_ptr().cast(), at, mask))
+        }
+    }
+}
+
+impl Mask for M {
+    #[inline(always)]
+    fn none() -> M {
+        // SAFETY: see the page of this module.
+        unsafe { M(_mm256_setzero_ps()) }
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        // SAFETY: see the page of this module.
+        unsafe { _mm256_movemask_ps(self.0) as u32 }
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> M {
+        // SAFETY: see the page of this module.
+        unsafe {
+            let places = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            let bits = _mm256_and_si256(_mm256_set1_epi32(bits as i32), places);
+            M(_mm256_castsi256_ps(_mm256_cmpeq_epi32(bits, places)))
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Sixteen lanes, with AVX-512.
+//!
+//! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
+
+use super::{Floats, Ints, Kernel, Lanes, Mask};
+use std::arch::x86_64::*;
+use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
+
+#[derive(Clone, Copy)]
+pub(crate) struct Sixteen;
+
+#[derive(Clone, Copy)]
+pub(crate) struct F(__m512);
+#[derive(Clone, Copy)]
+pub(crate) struct I(__m512i);
+#[derive(Clone, Copy)]
+pub(crate) struct M(__mmask16);
+
+impl Lanes for Sixteen {
+    const N: usize = 16;
+    type F = F;
+    type I = I;
+    type M = M;
+}
+
+/// # Safety
+/// The processor must have AVX-512 F, BW, DQ and VL.
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,popcnt,bmi1,bmi2,lzcnt")]
+pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<Sixteen>()
+}
+
+macro_rules! operator {
+    ($type:ident, $trait:ident, $name:ident, $intrinsic:ident) => {
+        impl $trait for $type {
+            type Output = $type;
+            #[inline(always)]
+            fn $name(self, other: $type) -> $type {
+                // SAFETY: see the page of this module.
+                unsafe { $type($intrinsic(self.0, other.0)) }
+            }
+        }
+    };
+}
+
+operator!(F, Add, add, _mm512_add_ps);
+operator!(F, Sub, sub, _mm512_sub_ps);
+operator!(F, Mul, mul, _mm512_mul_ps);
+operator!(I, Add, add, _mm512_add_epi32);
+operator!(I, Sub, sub, _mm512_sub_epi32);
+operator!(I, BitAnd, bitand, _mm512_and_si512);
+
+impl BitAnd for M {
+    type Output = M;
+    #[inline(always)]
+    fn bitand(self, other: M) -> M {
+        M(self.0 & other.0)
+    }
+}
+
+impl BitOr for M {
+    type Output = M;
+    #[inline(always)]
+    fn bitor(self, other: M) -> M {
+        M(self.0 | other.0)
+    }
+}
+
+impl Not for M {
+    type Output = M;
+    #[inline(always)]
+    fn not(self) -> M {
+        M(!self.0)
+    }
+}
+
+impl Neg for F {
+    type Output = F;
+    #[inline(always)]
+    fn neg(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_xor_ps(self.0, _mm512_set1_ps(-0.0))) }
+    }
+}
+
+macro_rules! binary {
+    ($name:ident, $result:ident, $intrinsic:ident $(, $constant:ident)?) => {
+        #[inline(always)]
+        fn $name(self, other: Self) -> $result {
+            // SAFETY: see the page of this module.
+            unsafe { $result($intrinsic $(::<$constant>)? (self.0, other.0)) }
+        }
+    };
+}
+
+impl Floats for F {
+    type I = I;
+    type M = M;
+    #[inline(always)]
+    fn splat(value: f32) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_set1_ps(value)) }
+    }
+    #[inline(always)]
+    fn load(values: &[f32]) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_loadu_ps(values[..16].as_ptr())) }
+    }
+    #[inline(always)]
+    fn store(self, values: &mut [f32]) {
+        // SAFETY: see the page of this module.
+        unsafe { _mm512_storeu_ps(values[..16].as_mut_ptr(), self.0) }
+    }
+    binary!(div, F, _mm512_div_ps);
+    #[inline(always)]
+    fn sqrt(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_sqrt_ps(self.0)) }
+    }
+    binary!(min, F, _mm512_min_ps);
+    binary!(max, F, _mm512_max_ps);
+    #[inline(always)]
+    fn abs(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_abs_ps(self.0)) }
+    }
+    binary!(lt, M, _mm512_cmp_ps_mask, _CMP_LT_OQ);
+    binary!(le, M, _mm512_cmp_ps_mask, _CMP_LE_OQ);
+    #[inline(always)]
+    fn select(mask: M, yes: F, no: F) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_mask_blend_ps(mask.0, no.0, yes.0)) }
+    }
+    #[inline(always)]
+    fn truncate(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_cvttps_epi32(self.0)) }
+    }
+    #[inline(always)]
+    fn floor(self) -> I {
+        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_cvttps_epi32(_mm512_roundscale_ps::<DOWN>(self.0))) }
+    }
+    #[inline(always)]
+    fn from_bits(bits: I) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_castsi512_ps(bits.0)) }
+    }
+    #[inline(always)]
+    fn scatter(self, table: &mut [f32], at: I, mask: M) {
+        let last = (table.len().min(i32::MAX as usize) - 1) as i32;
+        // SAFETY: see the page of this module.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+            _mm512_mask_i32scatter_ps::<4>(table.as_mut_ptr().cast(), mask.0, at, self.0);
+        }
+    }
+}
+
+impl Ints for I {
+    type F = F;
+    type M = M;
+    #[inline(always)]
+    fn splat(value: i32) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_set1_epi32(value)) }
+    }
+    #[inline(always)]
+    fn load(values: &[i32]) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_loadu_si512(values[..16].as_ptr().cast())) }
+    }
+    #[inline(always)]
+    fn store(self, values: &mut [i32]) {
+        // SAFETY: see the page of this module.
+        unsafe { _mm512_storeu_si512(values[..16].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn to_floats(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_cvtepi32_ps(self.0)) }
+    }
+    binary!(shr, I, _mm512_srav_epi32);
+    binary!(shl, I, _mm512_sllv_epi32);
+    binary!(times, I, _mm512_mullo_epi32);
+    binary!(min, I, _mm512_min_epi32);
+    binary!(max, I, _mm512_max_epi32);
+    binary!(eq, M, _mm512_cmpeq_epi32_mask);
+    binary!(lt, M, _mm512_cmplt_epi32_mask);
+    #[inline(always)]
+    fn select(mask: M, yes: I, no: I) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_mask_blend_epi32(mask.0, no.0, yes.0)) }
+    }
+    #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+            let none = _mm512_setzero_si512();
+            I(_mm512_mask_i32gather_epi32::<2>(none, mask.0, at, table.as_ptr().cast()))
+        }
+    }
+    #[inline(always)]
+    fn gather(table: &[u32], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 1) as i32;
+        // SAFETY: see the page of this module.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+            let none = _mm512_setzero_si512();
+            I(_mm512_mask_i32gather_epi32::<4>(none, mask.0, at, table.as_ptr().cast()))
+        }
+    }
+}
+
+impl Mask for M {
+    #[inline(always)]
+    fn none() -> M {
+        M(0)
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        u32::from(self.0)
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> M {
+        M(bits as u16)
+    }
+}

@@ -1,0 +1,574 @@
+//! N rays over the level-of-detail surface, each along its own line on the map.
+//!
+//! A ray is held by the direction of its line and by its slope: at map distance s from the
+//! camera it is `s (k1 + s (k2 + s k3))` above the camera, which over flat ground is
+//! `s tan(elevation)` and over the Earth the first three terms of the straight ray's
+//! height over a sphere; the next is below 0.03 px at 300 km.
+//!
+//! Lanes walk on their own, from cell to cell, and past blocks of cells whose maximum
+//! they clear, as `exact` does. A lane remembers the cell where its last ray ended, with
+//! the ground along its line there. A ray of the same line that rises more steeply meets
+//! nothing before that cell (Cohen-Or et al., section 2), so it begins there.
+//!
+//! **What is found depends on the line and the slope alone**, not on where the lane began:
+//! where a line crosses the grid is one expression, a cell's answer depends on nothing but
+//! the cell, and a block is passed only with more room than all rounding takes.
+
+use crate::lanes::{Floats, Ints, Lanes, Mask};
+use crate::relief::{Relief, Soil};
+use terrafarm_terrain::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
+use terrafarm_terrain::tile::{Codes, HeightTile, Heights, MAXIMA_LEVELS, VOID};
+
+/// How far above a block's maximum a ray must stay to pass it: metres, and a share of its
+/// height over or under the camera. Rounding is an eighth of that.
+const CLEARANCE_M: f32 = 0.02;
+const CLEARANCE_SHARE: f32 = 2e-6;
+/// The least part of a line's direction along an axis: what is less runs along the grid.
+const ALONG_GRID: f32 = 1e-12;
+/// The plot of lanes that have left the layer.
+const NOWHERE: i32 = -1;
+
+/// The lines of N rays.
+pub(crate) struct Lines<L: Lanes> {
+    /// Cells of level 0 per metre, along x and y.
+    rate: [L::F; 2],
+    /// Metres per cell.
+    inverse: [L::F; 2],
+    /// 1 along an axis on which the index of the cell grows, else 0.
+    ahead: [L::I; 2],
+    /// Distance at which the line comes over the layer ...
+    enter: L::F,
+    /// ... and leaves it.
+    leave: L::F,
+}
+
+/// How rays rise over their lines; see the module's page.
+#[derive(Clone, Copy)]
+pub(crate) struct Slopes<L: Lanes> {
+    k1: L::F,
+    k2: L::F,
+    k3: L::F,
+}
+
+/// The rays of each line, in the order in which they rise: ray n has the tangent of
+/// elevation `(rise + d higher) / (length + d longer)` with `d = first + n step`, and its
+/// answer belongs at `at + n pitch`.
+pub(crate) struct Rows<L: Lanes> {
+    pub rise: L::F,
+    pub higher: L::F,
+    pub length: L::F,
+    pub longer: L::F,
+    pub first: f32,
+    pub step: f32,
+    pub count: i32,
+    pub at: L::I,
+    pub pitch: i32,
+}
+
+/// N lanes: their lines and rays, and where each is.
+pub(crate) struct Walk<'r, 'a, L: Lanes> {
+    relief: &'r Relief<'a>,
+    lines: Lines<L>,
+    rows: Rows<L>,
+    /// The ray that each lane casts, and its slope.
+    row: L::I,
+    slopes: Slopes<L>,
+    /// The plot, or `NOWHERE` if the lane has left the layer or cast its last ray.
+    plot: L::I,
+    /// How far the ray is known to be free.
+    free: L::F,
+    /// A tile was missing on the way.
+    unsure: L::M,
+    /// Blocks and cells looked at.
+    pub steps: u64,
+}
+
+/// The ground of a cell along a line, over the camera.
+#[derive(Clone, Copy)]
+struct Profile<L: Lanes> {
+    /// Distance at which the line enters the cell ...
+    start: L::F,
+    /// ... and leaves it.
+    end: L::F,
+    /// Height at both.
+    low: L::F,
+    high: L::F,
+    /// How much the ground bends in between.
+    curl: L::F,
+}
+
+impl<L: Lanes> Lines<L> {
+    /// Lines with a unit direction along x and y.
+    #[inline(always)]
+    pub(crate) fn new(relief: &Relief, direction: [L::F; 2]) -> Self {
+        let mut lines: Lines<L> = Lines {
+            rate: direction,
+            inverse: direction,
+            ahead: [L::I::splat(0); 2],
+            enter: L::F::splat(0.0),
+            leave: L::F::splat(f32::INFINITY),
+        };
+        let least = L::F::splat(ALONG_GRID);
+        for axis in 0..2 {
+            let rate = direction[axis] * L::F::splat((1.0 / relief.spacing[axis]) as f32);
+            let rate = L::F::select(rate.abs().lt(least), least, rate);
+            lines.rate[axis] = rate;
+            lines.inverse[axis] = L::F::splat(1.0).div(rate);
+            let ahead = L::F::splat(0.0).lt(rate);
+            lines.ahead[axis] = L::I::select(ahead, L::I::splat(1), L::I::splat(0));
+            let first = lines.crossing(relief, axis, L::I::splat(0));
+            let last = lines.crossing(relief, axis, L::I::splat(relief.cells[axis]));
+            lines.enter = lines.enter.max(first.min(last));
+            lines.leave = lines.leave.min(first.max(last));
+        }
+        lines
+    }
+
+    /// Distance at which the lines cross a grid line of level 0.
+    #[inline(always)]
+    fn crossing(&self, relief: &Relief, axis: usize, line: L::I) -> L::F {
+        let apart = (line - L::I::splat(relief.eye_cell[axis])).to_floats()
+            - L::F::splat(relief.eye_place[axis]);
+        apart * self.inverse[axis]
+    }
+
+    /// Place at a distance, in cells of level 0 from the cell of the camera.
+    #[inline(always)]
+    fn place(&self, relief: &Relief, axis: usize, s: L::F) -> L::F {
+        L::F::splat(relief.eye_place[axis]) + s * self.rate[axis]
+    }
+
+    /// The cell of a level, or block of cells of level 0, just after a distance, agreeing
+    /// with `crossing`; kept from `low` to `high`.
+    #[inline(always)]
+    fn cell_after(
+        &self,
+        relief: &Relief,
+        axis: usize,
+        s: L::F,
+        level: L::I,
+        low: L::I,
+        high: L::I,
+    ) -> L::I {
+        let eye = L::I::splat(relief.eye_cell[axis]);
+        let guess = (self.place(relief, axis, s).floor() + eye).shr(level).max(low).min(high);
+        let ahead = self.ahead[axis];
+        let one = L::I::splat(1);
+        let back = one - ahead;
+        let out = self.crossing(relief, axis, (guess + ahead).shl(level));
+        let into = self.crossing(relief, axis, (guess + back).shl(level));
+        let step = ahead - back;
+        let later = L::I::select(out.le(s), step, L::I::splat(0));
+        let earlier = L::I::select(s.lt(into), step, L::I::splat(0));
+        (guess + later - earlier).max(low).min(high)
+    }
+}
+
+impl<L: Lanes> Slopes<L> {
+    /// Rays of a tangent of elevation at the camera.
+    #[inline(always)]
+    pub(crate) fn new(relief: &Relief, tangent: L::F) -> Self {
+        let k = relief.curvature as f32;
+        let grown = L::F::splat((1.0 + relief.curvature * relief.eye_z) as f32);
+        let square = tangent * tangent;
+        let k2 = (L::F::splat(0.5) + square) * L::F::splat(k);
+        let k3 = tangent * (L::F::splat(5.0 / 6.0) + square) * L::F::splat(k * k);
+        Slopes { k1: grown * tangent, k2: grown * k2, k3: grown * k3 }
+    }
+
+    /// Height over the camera.
+    #[inline(always)]
+    pub(crate) fn height(&self, s: L::F) -> L::F {
+        s * (self.k1 + s * (self.k2 + s * self.k3))
+    }
+
+    /// How much the ray bends over a piece that ends at `end`: its height there is the
+    /// straight line between the ends, less at most a quarter of this.
+    #[inline(always)]
+    fn bend(&self, length: L::F, end: L::F) -> L::F {
+        (self.k2 + end * (self.k3 * L::F::splat(3.0)).max(L::F::splat(0.0))) * length * length
+    }
+}
+
+impl<L: Lanes> Rows<L> {
+    #[inline(always)]
+    fn slopes(&self, relief: &Relief, row: L::I) -> Slopes<L> {
+        let d = L::F::splat(self.first) + row.to_floats() * L::F::splat(self.step);
+        Slopes::new(relief, (self.rise + d * self.higher).div(self.length + d * self.longer))
+    }
+}
+
+impl<L: Lanes> Profile<L> {
+    /// Whether and where rays meet the ground. With t from 0 to 1 through the cell, the
+    /// ray is `g(t) = g0 + b t + bend t^2` above it; see `cell`.
+    #[inline(always)]
+    fn contact(&self, slopes: &Slopes<L>) -> (L::M, L::F) {
+        let zero = L::F::splat(0.0);
+        let length = self.end - self.start;
+        let g0 = slopes.height(self.start) - self.low;
+        let g1 = slopes.height(self.end) - self.high;
+        let bend = slopes.bend(length, self.end) - self.curl;
+        let b = (g1 - g0) - bend;
+        let excess = bend - (g0 + g1);
+        let four = L::F::splat(4.0);
+        let dips = zero.lt(excess) & (four * g0 * g1).le(excess * excess);
+        let root = (b * b - four * bend * g0).max(zero).sqrt();
+        let falls = b.lt(zero);
+        let above = L::F::select(falls, g0 + g0, b + root);
+        let below = L::F::select(falls, root - b, L::F::splat(-2.0) * bend);
+        let t = above.div(below).max(zero).min(L::F::splat(1.0));
+        let inside = g0.le(zero);
+        let t = L::F::select(inside, zero, t);
+        ((inside | g1.le(zero) | dips) & self.start.lt(self.end), self.start + t * length)
+    }
+}
+
+impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
+    /// Lanes where their lines come over the layer, or at `free` if that is later.
+    #[inline(always)]
+    pub(crate) fn new(
+        relief: &'r Relief<'a>,
+        lines: Lines<L>,
+        rows: Rows<L>,
+        free: L::F,
+    ) -> Self {
+        let free = lines.enter.max(free);
+        let level = L::I::splat(MAXIMA_LEVELS as i32);
+        let zero = L::I::splat(0);
+        let columns = L::I::splat(relief.plots[0] - 1);
+        let column = lines.cell_after(relief, 0, free, level, zero, columns);
+        let last = L::I::splat(relief.plots[1] - 1);
+        let row = lines.cell_after(relief, 1, free, level, zero, last);
+        let plot = row.times(L::I::splat(relief.plots[0])) + column;
+        let plot = L::I::select(free.lt(lines.leave), plot, L::I::splat(NOWHERE));
+        let slopes = rows.slopes(relief, zero);
+        Walk {
+            relief,
+            lines,
+            rows,
+            row: zero,
+            slopes,
+            plot,
+            free,
+            unsure: L::M::none(),
+            steps: 0,
+        }
+    }
+
+    /// Casts all rays. Where they meet the surface goes to `met`, as distances on the map:
+    /// NaN where a missing tile leaves it open, and nothing for those that meet nothing.
+    #[inline(always)]
+    pub(crate) fn run(&mut self, met: &mut [f32]) {
+        let nowhere = L::I::splat(NOWHERE);
+        loop {
+            let left = !self.plot.eq(nowhere);
+            if !left.any() {
+                break;
+            }
+            let number = self.plot_of(left.bits().trailing_zeros() as usize);
+            let here = left & self.plot.eq(L::I::splat(number));
+            let plot = self.relief.plot(number);
+            match plot.ground {
+                Soil::Tile(tile) => self.cross(number, plot.level, tile, here, met),
+                Soil::Void => self.pass_plot(number, here),
+                Soil::Absent => {
+                    self.unsure = self.unsure | here;
+                    self.pass_plot(number, here);
+                }
+            }
+        }
+        while self.unsure.any() {
+            self.emit(L::F::splat(f32::NAN), self.unsure, met);
+            self.unsure = self.unsure & self.row.lt(L::I::splat(self.rows.count));
+        }
+    }
+
+    #[inline(always)]
+    fn plot_of(&self, lane: usize) -> i32 {
+        let mut plots = [0; 16];
+        self.plot.store(&mut plots);
+        plots[lane & 15]
+    }
+
+    /// Writes the answers of lanes; these go on with their next rays.
+    #[inline(always)]
+    fn emit(&mut self, s: L::F, lanes: L::M, met: &mut [f32]) {
+        let at = self.rows.at + self.row.times(L::I::splat(self.rows.pitch));
+        let s = L::F::select(self.unsure, L::F::splat(f32::NAN), s);
+        s.scatter(met, at, lanes);
+        let next = self.row + L::I::splat(1);
+        self.row = L::I::select(lanes, next, self.row);
+    }
+
+    /// Takes lanes past a plot in which there is nothing to hit.
+    #[inline(always)]
+    fn pass_plot(&mut self, number: i32, here: L::M) {
+        let corner = [
+            L::I::splat(number % self.relief.plots[0]),
+            L::I::splat(number / self.relief.plots[0]),
+        ];
+        let level = L::I::splat(MAXIMA_LEVELS as i32);
+        let (out, along_x) = self.exit(corner, level);
+        self.enter_next(corner, out, along_x, here);
+    }
+
+    /// Where lines leave the blocks of `1 << level` cells of level 0 that they are in, and
+    /// whether by a line across x.
+    #[inline(always)]
+    fn exit(&self, block: [L::I; 2], level: L::I) -> (L::F, L::M) {
+        let x_line = (block[0] + self.lines.ahead[0]).shl(level);
+        let y_line = (block[1] + self.lines.ahead[1]).shl(level);
+        let x = self.lines.crossing(self.relief, 0, x_line);
+        let y = self.lines.crossing(self.relief, 1, y_line);
+        (x.min(y), x.le(y))
+    }
+
+    /// Puts lanes into the plot behind the line by which they leave theirs at `s`.
+    #[inline(always)]
+    fn enter_next(&mut self, plot: [L::I; 2], s: L::F, along_x: L::M, lanes: L::M) {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let [ahead_x, ahead_y] = self.lines.ahead;
+        let column = L::I::select(along_x, plot[0] + ahead_x + ahead_x - one, plot[0]);
+        let row = L::I::select(along_x, plot[1], plot[1] + ahead_y + ahead_y - one);
+        let columns = L::I::splat(self.relief.plots[0]);
+        let rows = L::I::splat(self.relief.plots[1]);
+        let inside = !column.lt(zero) & column.lt(columns) & !row.lt(zero) & row.lt(rows);
+        let inside = inside & s.lt(self.lines.leave);
+        let number = row.times(columns) + column;
+        let next = L::I::select(inside, number, L::I::splat(NOWHERE));
+        self.plot = L::I::select(lanes, next, self.plot);
+        self.free = L::F::select(lanes, s, self.free);
+    }
+
+    #[inline(always)]
+    fn cross(&mut self, number: i32, level: u32, tile: &HeightTile, here: L::M, met: &mut [f32]) {
+        match tile.heights() {
+            Heights::Codes(codes) => {
+                let soil = Coded::new(codes, self.relief.eye_z);
+                self.cross_soil(number, level, &soil, here, met);
+            }
+            Heights::Floats(_) => self.pass_plot(number, here),
+        }
+    }
+
+    /// Takes lanes over a plot, until each has left it or has cast its last ray.
+    ///
+    /// A lane either has a cell before it whose contact with its ray is to be found, or is
+    /// on its way to the next such cell. What most lanes wait for is done first.
+    #[inline(always)]
+    fn cross_soil(
+        &mut self,
+        number: i32,
+        level: u32,
+        soil: &Coded,
+        here: L::M,
+        met: &mut [f32],
+    ) {
+        let relief = self.relief;
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let base = L::I::splat(level as i32);
+        // The blocks of maxima that are as large as the plot.
+        let top = L::I::splat((MAXIMA_LEVELS as u32 - level) as i32);
+        let plot = [
+            L::I::splat(number % relief.plots[0]),
+            L::I::splat(number / relief.plots[0]),
+        ];
+        let side = one.shl(top) - one;
+        let first = [plot[0].shl(top), plot[1].shl(top)];
+        let mut cell = [
+            self.lines.cell_after(relief, 0, self.free, base, first[0], first[0] + side),
+            self.lines.cell_after(relief, 1, self.free, base, first[1], first[1] + side),
+        ];
+        let none = L::F::splat(0.0);
+        let mut profile =
+            Profile::<L> { start: none, end: none, low: none, high: none, curl: none };
+        let mut block = top;
+        let mut left = here;
+        let mut ready = L::M::none();
+        let mut pass = L::M::none();
+        while left.any() {
+            let going = left & !ready;
+            if ready.count() >= going.count() {
+                let (hit, s) = profile.contact(&self.slopes);
+                let hit = hit & ready;
+                if hit.any() {
+                    self.emit(s, hit, met);
+                    self.slopes = self.rows.slopes(relief, self.row);
+                    let done = hit & !self.row.lt(L::I::splat(self.rows.count));
+                    self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
+                    left = left & !done;
+                    ready = ready & !done;
+                }
+                let missed = ready & !hit;
+                pass = pass | missed;
+                ready = ready & !missed;
+                continue;
+            }
+            // To the cell or block behind the one that the lane has done with.
+            let mut within = [cell[0].shr(block), cell[1].shr(block)];
+            let (mut out, mut along_x) = self.exit(within, base + block);
+            if pass.any() {
+                let behind_x = (within[0] + self.lines.ahead[0]).shl(block) - one + self.lines.ahead[0];
+                let behind_y = (within[1] + self.lines.ahead[1]).shl(block) - one + self.lines.ahead[1];
+                let mut beside = cell;
+                if (pass & !block.eq(zero)).any() {
+                    let side = one.shl(block) - one;
+                    let low = within[0].shl(block);
+                    beside[0] = self.lines.cell_after(relief, 0, out, base, low, low + side);
+                    let low = within[1].shl(block);
+                    beside[1] = self.lines.cell_after(relief, 1, out, base, low, low + side);
+                }
+                let next = [
+                    L::I::select(along_x, behind_x, beside[0]),
+                    L::I::select(along_x, beside[1], behind_y),
+                ];
+                let before = L::I::select(along_x, cell[0], cell[1]);
+                let after = L::I::select(along_x, next[0], next[1]);
+                let outside = !before.shr(top).eq(after.shr(top)) | !out.lt(self.lines.leave);
+                let leaving = pass & outside;
+                if leaving.any() {
+                    self.enter_next(plot, out, along_x, leaving);
+                    left = left & !leaving;
+                }
+                let moving = pass & !leaving;
+                cell[0] = L::I::select(moving, next[0], cell[0]);
+                cell[1] = L::I::select(moving, next[1], cell[1]);
+                self.free = L::F::select(moving, out, self.free);
+                let parent = block + one;
+                let crossed = !before.shr(parent).eq(after.shr(parent)) & block.lt(top);
+                block = L::I::select(moving & crossed, parent, block);
+                pass = L::M::none();
+                within = [cell[0].shr(block), cell[1].shr(block)];
+                (out, along_x) = self.exit(within, base + block);
+            }
+            let going = left & !ready;
+            let cells = going & block.eq(zero);
+            let blocks = going & !cells;
+            let out = out.min(self.lines.leave);
+            let _ = along_x;
+            if blocks.any() {
+                self.steps += u64::from(blocks.count());
+                let highest = soil.maximum::<L>(block, within, blocks);
+                let lowest = self.slopes.height(self.free).min(self.slopes.height(out))
+                    - L::F::splat(0.25) * self.slopes.bend(out - self.free, out);
+                let room = L::F::splat(CLEARANCE_M) + lowest.abs() * L::F::splat(CLEARANCE_SHARE);
+                let clear = blocks & (highest + room).lt(lowest);
+                pass = pass | clear;
+                block = L::I::select(blocks & !clear, block - one, block);
+            }
+            if cells.any() {
+                self.steps += u64::from(cells.count());
+                let solid = self.look(soil, cell, base, out, cells, &mut profile);
+                ready = ready | (cells & solid);
+                pass = pass | (cells & !solid);
+            }
+        }
+    }
+
+    /// Reads the ground of cells, for the lanes in `lanes`. Returns which have any.
+    #[inline(always)]
+    fn look(
+        &mut self,
+        soil: &Coded,
+        cell: [L::I; 2],
+        level: L::I,
+        end: L::F,
+        lanes: L::M,
+        profile: &mut Profile<L>,
+    ) -> L::M {
+        let relief = self.relief;
+        let (solid, [sw, se, nw, ne]) = soil.corners::<L>(cell, lanes);
+        let start = self.free;
+        let shrink = L::F::splat(1.0).div(L::I::splat(1).shl(level).to_floats());
+        let x0 = self.share(relief, 0, cell[0], level, shrink, start);
+        let x1 = self.share(relief, 0, cell[0], level, shrink, end);
+        let y0 = self.share(relief, 1, cell[1], level, shrink, start);
+        let y1 = self.share(relief, 1, cell[1], level, shrink, end);
+        let (south, north) = (se - sw, ne - nw);
+        let (a0, b0) = (sw + south * x0, nw + north * x0);
+        let (a1, b1) = (sw + south * x1, nw + north * x1);
+        let curl = (north - south) * (x1 - x0) * (y1 - y0);
+        profile.start = L::F::select(lanes, start, profile.start);
+        profile.end = L::F::select(lanes, end, profile.end);
+        profile.low = L::F::select(lanes, a0 + (b0 - a0) * y0, profile.low);
+        profile.high = L::F::select(lanes, a1 + (b1 - a1) * y1, profile.high);
+        profile.curl = L::F::select(lanes, curl, profile.curl);
+        solid & lanes
+    }
+
+    /// Where in a cell a line is along an axis, 0 to 1.
+    #[inline(always)]
+    fn share(
+        &self,
+        relief: &Relief,
+        axis: usize,
+        cell: L::I,
+        level: L::I,
+        shrink: L::F,
+        s: L::F,
+    ) -> L::F {
+        let corner = (cell.shl(level) - L::I::splat(relief.eye_cell[axis])).to_floats();
+        let share = (self.lines.place(relief, axis, s) - corner) * shrink;
+        share.max(L::F::splat(0.0)).min(L::F::splat(1.0))
+    }
+}
+
+/// A tile of codes, with heights over the camera.
+struct Coded<'a> {
+    posts: &'a [u16],
+    maxima: &'a [u16],
+    base: f32,
+    step: f32,
+}
+
+impl<'a> Coded<'a> {
+    fn new(codes: Codes<'a>, eye_z: f64) -> Self {
+        Coded {
+            posts: codes.posts,
+            maxima: codes.maxima,
+            base: (f64::from(codes.base) * codes.step - eye_z) as f32,
+            step: codes.step as f32,
+        }
+    }
+
+    /// Highest ground of blocks; `block` from 1.
+    #[inline(always)]
+    fn maximum<L: Lanes>(&self, block: L::I, within: [L::I; 2], lanes: L::M) -> L::F {
+        // A tile has `1 << bits` blocks along a side. The levels of maxima lie one after
+        // another, so those of this one begin behind (4^8 - 4^(bits + 1)) / 3 others; the
+        // product is that third to the last unit.
+        let (one, bits) = (L::I::splat(1), L::I::splat(MAXIMA_LEVELS as i32) - block);
+        let mask = one.shl(bits) - one;
+        let before = L::I::splat(1 << (2 * MAXIMA_LEVELS)) - one.shl(bits + bits + one + one);
+        let start = before.times(L::I::splat(0x5556)).shr(L::I::splat(16));
+        let at = start + (within[1] & mask).shl(bits) + (within[0] & mask);
+        let code = L::I::gather_pairs(self.maxima, at, lanes) & L::I::splat(0xFFFF);
+        L::F::splat(self.base) + code.to_floats() * L::F::splat(self.step)
+    }
+
+    /// Corners of cells: south-west, south-east, north-west, north-east; and whether all
+    /// four are there.
+    #[inline(always)]
+    fn corners<L: Lanes>(&self, cell: [L::I; 2], lanes: L::M) -> (L::M, [L::F; 4]) {
+        let mask = L::I::splat(TILE_CELLS as i32 - 1);
+        let ring = L::I::splat(TILE_RING as i32);
+        let width = L::I::splat(TILE_POSTS as i32);
+        let at = ((cell[1] & mask) + ring).times(width) + (cell[0] & mask) + ring;
+        let south = L::I::gather_pairs(self.posts, at, lanes);
+        let north = L::I::gather_pairs(self.posts, at + width, lanes);
+        let low = L::I::splat(0xFFFF);
+        let sixteen = L::I::splat(16);
+        let codes = [
+            south & low,
+            south.shr(sixteen) & low,
+            north & low,
+            north.shr(sixteen) & low,
+        ];
+        let void = L::I::splat(i32::from(VOID));
+        let highest = codes[0].max(codes[1]).max(codes[2].max(codes[3]));
+        let height = |code: L::I| {
+            L::F::splat(self.base) + code.to_floats() * L::F::splat(self.step)
+        };
+        (highest.lt(void), [height(codes[0]), height(codes[1]), height(codes[2]), height(codes[3])])
+    }
+}
