@@ -268,6 +268,7 @@ fn judge(land: &Land, number: usize, stand: &Stand, mut runs: Runs) -> Case {
     };
     let pixels = f64::from(size[0]) * f64::from(size[1]);
     let seconds = median(&mut runs.seconds);
+    let ground = depths.distance_m.iter().filter(|distance| distance.is_finite()).count();
     let mismatch = errors.mismatch();
     let spread = Spread::of(errors.error_px);
     let promise = Promise::of(quality.method, quality.tolerance_px);
@@ -285,7 +286,7 @@ fn judge(land: &Land, number: usize, stand: &Stand, mut runs: Runs) -> Case {
         mpix_per_cpu_s: Some(pixels / seconds * 1e-6),
         ns_per_pixel: Some(seconds / pixels * 1e9),
         steps_per_pixel: Some(depths.stats.steps as f64 / pixels),
-        ground: Some(depths.stats.hits as f64 / pixels),
+        ground: Some(ground as f64 / pixels),
         error_px_p50: Some(spread.p50),
         error_px_p99: Some(spread.p99),
         error_px_max: Some(spread.max),

@@ -1,21 +1,17 @@
 //! The ray caster as a bench asks it: distances, and how far one of them is off.
 
 use super::land::Land;
+use glam::DVec3;
+use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
-use terrafarm_raycast::{Missing, Pyramid, Stats, View, cast, render, trace};
-use terrafarm_terrain::resident::Resident;
+use terrafarm_common::shading::Shading;
+use terrafarm_raycast::{Missing, View, cast, depths, render};
+
+pub use terrafarm_raycast::Depths;
 
 /// Pixels of a picture that are compared with the truth, about.
 const CHECKED_PIXELS: f64 = 20_000.0;
-
-/// Distances to the ground through the centres of the pixels of a region.
-pub struct Depths {
-    /// Metres, row by row; infinite where there is no ground.
-    pub distance_m: Vec<f32>,
-    /// What it took.
-    pub stats: Stats,
-}
 
 /// Why there is no answer: a method that does not do this view says so.
 #[derive(Debug, Clone)]
@@ -42,41 +38,55 @@ impl PixelError {
     }
 }
 
-fn depths(
-    resident: &Resident,
-    pyramid: &Pyramid,
-    view: &View,
-    region: Region,
-) -> Result<Depths, Missing> {
-    let mut distance_m = vec![f32::INFINITY; region.area() as usize];
-    let width = region.width as usize;
-    let stats = trace(resident, pyramid, view, region, |x, y, hit| {
-        let (column, row) = ((x - region.x) as usize, (y - region.y) as usize);
-        distance_m[row * width + column] = hit.map_or(f32::INFINITY, |hit| hit.distance_m as f32);
-    })?;
-    Ok(Depths { distance_m, stats })
-}
-
+/// How far a claimed distance is off: the height of the ray there above or below the
+/// surface, as pixels of the picture. A ray cast straight down tells the surface.
 fn measure(
-    resident: &Resident,
-    pyramid: &Pyramid,
+    land: &Land,
     view: &View,
-    x: u32,
-    y: u32,
-    claimed_distance_m: f32,
+    place: [u32; 2],
+    claimed_m: f32,
 ) -> Result<PixelError, Missing> {
+    let [x_px, y_px] = place.map(|pixel| f64::from(pixel) + 0.5);
     let quality = Quality { method: Method::Exact, ..view.quality };
     let truth = View { quality, ..view.clone() };
-    let hit = cast(resident, pyramid, &truth, f64::from(x) + 0.5, f64::from(y) + 0.5)?;
-    let distance = hit.map_or(f64::INFINITY, |hit| hit.distance_m);
-    let claimed = f64::from(claimed_distance_m);
-    let mismatch = distance.is_finite() != claimed.is_finite();
-    let off = match (distance.is_finite(), claimed.is_finite()) {
-        (true, true) => (distance - claimed).abs() / distance.max(f64::MIN_POSITIVE),
-        (false, false) => 0.0,
-        _ => f64::INFINITY,
+    let seen = cast(&land.resident, &land.pyramid, &truth, x_px, y_px)?;
+    let claimed_m = f64::from(claimed_m);
+    if !claimed_m.is_finite() {
+        return Ok(PixelError { surface_px: 0.0, mismatch: seen.is_some() });
+    }
+    let point = at_distance(view, x_px, y_px, claimed_m);
+    let above = DVec3::new(point.x, point.y, land.pyramid.highest() + 1000.0);
+    let down = View {
+        camera: Camera::from_angles(above, 0.0, -90.0, 0.0, 1.0, (1, 1)),
+        shading: Shading { earth: None, ..view.shading.clone() },
+        quality,
     };
-    Ok(PixelError { surface_px: off * view.camera.focal_px(), mismatch })
+    let below = cast(&land.resident, &land.pyramid, &down, 0.5, 0.5)?;
+    let scale = view.camera.focal_px() / claimed_m.max(f64::MIN_POSITIVE);
+    // Without ground below, what is claimed may still be a wall at the edge of the land.
+    let off_m = match (below, seen) {
+        (Some(below), _) => (below.height - point.z).abs(),
+        (None, Some(seen)) => (seen.distance_m - claimed_m).abs(),
+        (None, None) => 0.0,
+    };
+    let wall_m = seen.map_or(f64::INFINITY, |seen| (seen.distance_m - claimed_m).abs());
+    Ok(PixelError { surface_px: off_m.min(wall_m) * scale, mismatch: seen.is_none() })
+}
+
+/// The point of a pixel's ray at a distance, on the map and above the sphere if there is
+/// one.
+fn at_distance(view: &View, x_px: f64, y_px: f64, distance_m: f64) -> DVec3 {
+    let (eye, ray) = (view.camera.position, view.camera.ray(x_px, y_px).normalize());
+    let Some(earth) = view.shading.earth else { return eye + ray * distance_m };
+    let radius = earth.effective_radius_m();
+    let level = DVec3::new(ray.x, ray.y, 0.0);
+    let (out, up) = (distance_m * level.length(), radius + eye.z + distance_m * ray.z);
+    let arc_m = radius * libm::atan2(out, up);
+    let on_map = level.normalize_or_zero() * arc_m;
+    // The rise above the sphere without the difference of two large numbers.
+    let climb = distance_m * (distance_m + 2.0 * (radius + eye.z) * ray.z);
+    let rise = climb / (libm::hypot(out, up) + radius + eye.z);
+    DVec3::new(eye.x + on_map.x, eye.y + on_map.y, eye.z + rise)
 }
 
 /// The distances of a whole picture.
@@ -128,7 +138,7 @@ pub fn errors(
         for column in along(region.width) {
             let claimed = answer.distance_m[row as usize * region.width as usize + column as usize];
             let (x, y) = (region.x + column, region.y + row);
-            let pixel = measure(&land.resident, &land.pyramid, view, x, y, claimed)?;
+            let pixel = measure(land, view, [x, y], claimed)?;
             errors.error_px.push(pixel.error_px());
             errors.mismatched += usize::from(pixel.mismatch);
         }

@@ -36,6 +36,8 @@ pub struct Land {
     pub resident: Resident,
     /// The maxima of its index.
     pub pyramid: Pyramid,
+    /// Memory of the tiles of heights, bytes.
+    height_bytes: usize,
     /// Goes away with the land.
     _folder: Option<TempDir>,
 }
@@ -130,13 +132,17 @@ impl Land {
             );
         }
         let mut resident = Resident::new(index.clone());
+        let mut height_bytes = 0;
         for key in keys {
             if let Some(tile) = store.read_tile(key)? {
+                if tile.kind() == LayerKind::Height {
+                    height_bytes += tile.memory_bytes();
+                }
                 resident.insert(key, tile);
             }
         }
         let pyramid = Pyramid::new(&index);
-        Ok(Land { name, store, resident, pyramid, _folder: folder })
+        Ok(Land { name, store, resident, pyramid, height_bytes, _folder: folder })
     }
 
     /// The Earth under it; flat if the store lies nowhere on it.
@@ -148,11 +154,10 @@ impl Land {
     /// Memory of its tiles of heights, all levels, per post of level 0, bytes.
     pub fn bytes_per_post(&self) -> f64 {
         let index = self.resident.index();
-        let tiles = keys(index, Load::Heights).len() as f64;
         let layers = index.layers_of(LayerKind::Height);
         let posts: f64 =
             layers.map(|(_, layer)| layer.posts[0] as f64 * layer.posts[1] as f64).sum();
-        tiles * HEIGHT_TILE_BYTES as f64 / posts.max(1.0)
+        self.height_bytes as f64 / posts.max(1.0)
     }
 
     /// South-west and north-east corner of its first layer, metres.
