@@ -17,6 +17,7 @@ mod kernel;
 mod land;
 mod report;
 mod speed_accuracy;
+mod stability;
 
 use crate::Outcome;
 use crate::args;
@@ -26,6 +27,6 @@ pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
     match args {
         args::Bench::Core(args) => core::run(args),
         args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
-        args::Bench::Stability(_) => anyhow::bail!("this bench is being built"),
+        args::Bench::Stability(args) => stability::run(args),
     }
 }
