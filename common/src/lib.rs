@@ -4,6 +4,7 @@
 //! convention everywhere: a *grid frame* in metres, `x` east, `y` north, `z` up, taken
 //! from the projected reference system of a terrain store; positions are f64.
 
+pub mod accuracy;
 pub mod camera;
 pub mod flight;
 pub mod id;

@@ -40,6 +40,11 @@ impl Method {
         Method::Reference,
     ];
 
+    /// Whether [`Quality::tolerance_px`] means something to this method.
+    pub fn reads_tolerance(self) -> bool {
+        !matches!(self, Method::Exact | Method::Reference)
+    }
+
     /// The name on the command line and in the manifest.
     pub fn name(self) -> &'static str {
         match self {

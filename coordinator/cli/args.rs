@@ -1,5 +1,6 @@
 //! The command line as typed.
 
+use crate::input::{parse_method, parse_tolerance};
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -53,9 +54,25 @@ pub struct Demo {
     /// Seed of the terrain
     #[arg(long)]
     pub seed: Option<u64>,
+    /// How rays find the ground and what that may cost
+    #[command(flatten)]
+    pub casting: Casting,
     /// Print the result as JSON
     #[arg(long)]
     pub json: bool,
+}
+
+/// What `render` and `demo` have in common.
+#[derive(Debug, Clone, Copy, ClapArgs)]
+pub struct Casting {
+    /// How rays find the ground: auto, exact, lod, column, frustum, voxel or reference
+    /// [default: the scene's, else auto]
+    #[arg(long, value_parser = parse_method, value_name = "NAME")]
+    pub method: Option<Method>,
+    /// How far a method may displace what is seen, pixels, 0.01 to 64 [default: the
+    /// scene's, else 0.5]
+    #[arg(long, value_parser = parse_tolerance, value_name = "PX", allow_negative_numbers = true)]
+    pub tolerance: Option<f64>,
 }
 
 /// `terrafarm terrain ...`
@@ -218,9 +235,9 @@ pub struct Render {
     /// Render these frames only, such as 0..24 (the end is not included)
     #[arg(long, value_parser = parse_range, value_name = "FIRST..END")]
     pub frames: Option<(u32, u32)>,
-    /// How rays find the ground: exact or reference
-    #[arg(long)]
-    pub method: Option<Method>,
+    /// How rays find the ground and what that may cost
+    #[command(flatten)]
+    pub casting: Casting,
     /// Samples along each side of a pixel: 2 means 4 a pixel
     #[arg(long)]
     pub samples: Option<u32>,

@@ -48,7 +48,7 @@ pub struct Plan {
     pub store: Arc<StoreReader>,
     /// Light, air and sky.
     pub shading: Shading,
-    /// Method and samples.
+    /// Method, tolerance and samples.
     pub quality: Quality,
     /// How frames are cut into jobs.
     pub split: Split,
@@ -257,6 +257,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     };
     let done = rendered?;
     let finished = finished.ok_or_else(|| anyhow!("the output was not finished"))?;
+    let method = plan.quality.method;
     let manifest = Manifest {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),
         scene: plan.scene.display().to_string(),
@@ -265,9 +266,9 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         terrain_sha256: plan.store.index_blob().0.to_hex(),
         flight: Some(plan.flight.display().to_string()),
         output: finished.output.display().to_string(),
-        method: plan.quality.method.name().to_owned(),
+        method: method.name().to_owned(),
         samples: plan.quality.samples_per_side,
-        tolerance_px: None,
+        tolerance_px: method.reads_tolerance().then_some(plan.quality.tolerance_px),
         size: [spec.width, spec.height],
         fps: plan.fps,
         frames: records,

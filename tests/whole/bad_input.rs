@@ -163,7 +163,25 @@ fn an_unknown_method_lists_the_known_ones() {
     let world = World::new(40);
     let (_, stderr) =
         run(world.render().args(["--method", "exat", "-o"]).arg(world.dir.path("o")), 2);
-    assert!(stderr.contains("exact"), "{stderr}");
+    assert!(stderr.contains("did you mean \"exact\"?"), "{stderr}");
+    let (_, stderr) =
+        run(world.render().args(["--method", "quickest", "-o"]).arg(world.dir.path("o")), 2);
+    assert!(stderr.contains("auto, exact, lod, column"), "{stderr}");
+}
+
+#[test]
+fn a_tolerance_out_of_its_limits_says_what_they_are() {
+    let world = World::new(40);
+    for wrong in ["0", "-1", "0.005", "65", "nan", "inf", "some"] {
+        for command in [world.render().arg("-o").arg(world.dir.path("o")), terrafarm().arg("demo")]
+        {
+            let (_, stderr) = run(command.args(["--tolerance", wrong]), 2);
+            assert!(stderr.contains("0.01 to 64"), "{wrong}: {stderr}");
+        }
+    }
+    fs::write(&world.scene, "terrain = \"land.terrain\"\n[output]\ntolerance = 0\n").unwrap();
+    let (_, stderr) = run(world.render().arg("-o").arg(world.dir.path("o")), 2);
+    assert!(stderr.contains("scene.toml:3") && stderr.contains("0.01 to 64"), "{stderr}");
 }
 
 #[test]

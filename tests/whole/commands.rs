@@ -44,7 +44,8 @@ fn a_png_sequence_is_numbered_and_has_a_manifest() {
     let manifest: serde_json::Value =
         serde_json::from_slice(&fs::read(output.join("manifest.json")).unwrap()).unwrap();
     assert_eq!(manifest["size"], serde_json::json!([64, 36]));
-    assert_eq!(manifest["method"], "exact");
+    assert_eq!(manifest["method"], "auto");
+    assert_eq!(manifest["tolerance_px"], 0.5);
     assert_eq!(manifest["frames"].as_array().unwrap().len(), 3);
     let picture = read_png(&output.join("frame_00001.png"));
     assert_eq!(

@@ -40,6 +40,7 @@ pub fn run(args: &args::Demo) -> anyhow::Result<Outcome> {
         name: "demo".into(),
         output: folder.join("demo.mp4"),
         poster: Some((POSTER, folder.join("poster.png"))),
+        quality: args.casting.over(scene.quality),
         farm: Farm::Local(Crew::fill(Some(args.workers), None)),
         ..Plan::read(&scene, &choice)?
     };

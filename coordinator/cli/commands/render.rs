@@ -19,10 +19,7 @@ pub fn run(args: &args::Render) -> anyhow::Result<Outcome> {
 
 fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     let scene = read_scene(&args.scene)?;
-    let mut quality = scene.quality;
-    if let Some(method) = args.method {
-        quality = Quality { method, samples_per_side: default_samples(method), ..quality };
-    }
+    let mut quality = args.casting.over(scene.quality);
     if let Some(samples) = args.samples {
         quality.samples_per_side = samples;
     }
@@ -51,11 +48,17 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     })
 }
 
-/// Samples along a side of a pixel unless the user says otherwise.
-fn default_samples(method: Method) -> u32 {
-    match method {
-        Method::Reference => 8,
-        _ => 1,
+impl args::Casting {
+    /// What the scene says, but for what the user says.
+    pub fn over(&self, mut quality: Quality) -> Quality {
+        if let Some(method) = self.method {
+            let samples_per_side = if method == Method::Reference { 8 } else { 1 };
+            quality = Quality { method, samples_per_side, ..quality };
+        }
+        if let Some(tolerance_px) = self.tolerance {
+            quality.tolerance_px = tolerance_px;
+        }
+        quality
     }
 }
 

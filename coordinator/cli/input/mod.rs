@@ -11,6 +11,7 @@ use std::fmt;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use terrafarm_common::quality::{Method, Quality};
 
 /// A mistake in an input file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -61,6 +62,27 @@ fn read_text(file: &Path, limit: u64) -> Result<String, InputError> {
         .map_err(|_| InputError::in_file(file, "is not UTF-8 text; save it as UTF-8"))
 }
 
+/// A method by its name. A mistyped one is answered with the nearest.
+pub fn parse_method(text: &str) -> Result<Method, String> {
+    text.parse().map_err(|error: String| match nearest(text, &Method::ALL.map(Method::name)) {
+        Some(near) => format!("{error}; did you mean \"{near}\"?"),
+        None => error,
+    })
+}
+
+/// A tolerance in pixels as people write it: `0.5`.
+pub fn parse_tolerance(text: &str) -> Result<f64, String> {
+    let allowed = Quality::MIN_TOLERANCE_PX..=Quality::MAX_TOLERANCE_PX;
+    text.trim().parse().ok().filter(|number| allowed.contains(number)).ok_or_else(|| {
+        format!(
+            "a tolerance is a number of pixels from {} to {}, such as {}",
+            allowed.start(),
+            allowed.end(),
+            Quality::DEFAULT_TOLERANCE_PX
+        )
+    })
+}
+
 /// The known word nearest to a mistyped one, if one is near.
 fn nearest<'a>(word: &str, known: &[&'a str]) -> Option<&'a str> {
     let allowed = word.chars().count() / 3 + 1;
@@ -95,6 +117,27 @@ mod tests {
         assert_eq!(nearest("hieght", &known), Some("height"));
         assert_eq!(nearest("pich", &known), Some("pitch"));
         assert_eq!(nearest("speed", &known), None);
+    }
+
+    #[test]
+    fn a_mistyped_method_is_answered_with_the_nearest() {
+        assert_eq!(parse_method("lod"), Ok(Method::Lod));
+        let error = parse_method("colunm").expect_err("it is mistyped");
+        assert!(error.ends_with("did you mean \"column\"?"), "{error}");
+        let error = parse_method("quickest").expect_err("there is no such method");
+        assert!(error.contains("choose one of auto, exact, lod"), "{error}");
+        assert!(!error.contains("did you mean"), "{error}");
+    }
+
+    #[test]
+    fn a_tolerance_is_within_its_limits_or_refused() {
+        assert_eq!(parse_tolerance("0.5"), Ok(0.5));
+        assert_eq!(parse_tolerance("0.01"), Ok(0.01));
+        assert_eq!(parse_tolerance("64"), Ok(64.0));
+        for wrong in ["0", "-1", "0.009", "64.1", "nan", "inf", "-inf", "", "half", "1px"] {
+            let error = parse_tolerance(wrong).expect_err(wrong);
+            assert!(error.contains("0.01 to 64"), "{wrong}: {error}");
+        }
     }
 
     #[test]

@@ -6,7 +6,7 @@
 #![doc = include_str!("scene/example.toml")]
 //! ```
 
-use super::{InputError, read_text};
+use super::{InputError, parse_method, read_text};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use terrafarm_common::camera::{MAX_HFOV_DEG, MAX_SIDE_PX, MIN_HFOV_DEG};
@@ -28,7 +28,7 @@ pub struct Scene {
     pub hfov_deg: f64,
     /// Frames per second.
     pub fps: f64,
-    /// Method and samples.
+    /// Method, tolerance and samples.
     pub quality: Quality,
     /// Direct light, its azimuth still from true north.
     pub sun: Option<SunAngles>,
@@ -195,6 +195,7 @@ struct OutputTable {
     fps: Number,
     samples: Number,
     method: Option<Spanned<String>>,
+    tolerance: Number,
 }
 
 #[derive(Deserialize)]
@@ -230,13 +231,20 @@ impl SceneFile {
         }
         let most = f64::from(Quality::MAX_SAMPLES_PER_SIDE);
         let samples = number(self.output.samples, "[output] samples", 1.0, 1.0, most)?;
-        let method = source.read_as(self.output.method, Method::Exact, str::parse::<Method>)?;
+        let method = source.read_as(self.output.method, Method::Auto, parse_method)?;
+        let tolerance_px = number(
+            self.output.tolerance,
+            "[output] tolerance",
+            Quality::DEFAULT_TOLERANCE_PX,
+            Quality::MIN_TOLERANCE_PX,
+            Quality::MAX_TOLERANCE_PX,
+        )?;
         Ok(Scene {
             terrain,
             size,
             hfov_deg,
             fps: number(self.output.fps, "[output] fps", 30.0, 0.001, 1000.0)?,
-            quality: Quality { method, samples_per_side: samples as u32, ..Quality::default() },
+            quality: Quality { method, samples_per_side: samples as u32, tolerance_px },
             sun,
             haze,
             sky,

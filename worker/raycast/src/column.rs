@@ -14,9 +14,9 @@
 //! of its own row, and is seen where they see: in between if they see neighbouring
 //! ground, else where the nearer one does, which is at most half a pixel aside.
 
-use crate::lanes::{Floats, Ints, Kernel, Lanes, Mask};
+use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use crate::relief::Relief;
-use crate::walk::{Lines, Rows, Walk};
+use crate::walk::{Lines, Rows, Walk, as_bits};
 use glam::{DVec2, DVec3};
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
@@ -152,18 +152,31 @@ impl Frame {
         Fan { reference: band.reference, q: self.v[2] * scale, r: self.v[0] * scale, spacing: spacing() }
     }
 
-    /// The pixels of a row, of those from `minors`, that are seen along this frame's rows.
+    /// The pixels of a row, of those from `minors`, that are seen along this frame's rows:
+    /// those no further from V across than along.
     fn owned(&self, row: u32, minors: Range<u32>) -> Range<u32> {
-        // What is owned is convex: the ends tell of all in between.
-        if minors.is_empty() || (self.owns(minors.start, row) && self.owns(minors.end - 1, row)) {
+        let none = minors.start..minors.start;
+        if minors.is_empty() {
+            return none;
+        }
+        let owns = |minor: u32| self.owns(minor, row);
+        if owns(minors.start) && owns(minors.end - 1) {
             return minors;
         }
-        let first = minors.clone().find(|&minor| self.owns(minor, row));
-        let last = minors.clone().rfind(|&minor| self.owns(minor, row));
-        match (first, last) {
-            (Some(first), Some(last)) => first..last + 1,
-            _ => minors.start..minors.start,
+        let reach = self.apart(f64::from(row) + 0.5).abs();
+        let (a, b) = ((self.v[0] - reach) / self.v[2], (self.v[0] + reach) / self.v[2]);
+        let pixel = |place: f64| (place - 0.5).clamp(-1.0, f64::from(u32::MAX)) as u32;
+        let (mut first, mut last) = (pixel(a.min(b)), pixel(a.max(b)) + 1);
+        first = first.saturating_sub(1).clamp(minors.start, minors.end - 1);
+        last = (last + 1).clamp(minors.start, minors.end - 1);
+        // What is left of rounding.
+        while first < last && !owns(first) {
+            first += 1;
         }
+        while last > first && !owns(last) {
+            last -= 1;
+        }
+        if owns(first) { first..last + 1 } else { none }
     }
 }
 
@@ -276,7 +289,7 @@ impl Columns<'_, '_> {
         width: usize,
         at: usize,
     ) -> u64 {
-        let mut values = [[0.0f32; 16]; 6];
+        let mut values = [[0.0f32; MOST]; 6];
         for lane in 0..L::N {
             let line = (f64::from(first) + lane as f64 + 0.5) * fan.spacing;
             let start = frame.corner + frame.minor * line + frame.major * fan.reference;
@@ -306,7 +319,7 @@ impl Columns<'_, '_> {
             (rise + d(row) * higher) / (length + d(row) * longer)
         };
         let upwards = tangent(rows.start) <= tangent(rows.end - 1);
-        let mut lane = [0; 16];
+        let mut lane = [0; MOST];
         let last = (rows.len() - 1) * width;
         for (number, place) in lane.iter_mut().enumerate() {
             *place = (at + number + if upwards { 0 } else { last }) as i32;
@@ -347,14 +360,14 @@ impl Columns<'_, '_> {
         // Line k goes through k + 1/2.
         let start = (d * fan.r * scale - 0.5) as f32;
         let begin = frame.corner + frame.major * middle;
-        let mut numbers = [0.0f32; 16];
+        let mut numbers = [0.0f32; MOST];
         for (lane, number) in numbers.iter_mut().enumerate() {
             *number = lane as f32;
         }
         let numbers = L::F::load(&numbers);
         // The same bits, for gathers.
         let table = as_bits(rays);
-        let mut out = [0.0f32; 16];
+        let mut out = [0.0f32; MOST];
         let mut pixel = pixels.start;
         while pixel < pixels.end {
             let minor = numbers + L::F::splat(pixel as f32 + 0.5);
@@ -401,10 +414,4 @@ impl Columns<'_, '_> {
             pixel += L::N as u32;
         }
     }
-}
-
-/// Floats as the bits that they are.
-fn as_bits(values: &[f32]) -> &[u32] {
-    // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
-    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
 }

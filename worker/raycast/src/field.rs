@@ -108,31 +108,43 @@ impl<'a> Field<'a> {
     /// Whether a place is at or below the surface; the key of the tile that is needed to
     /// tell if it is not loaded.
     pub(crate) fn is_below(&self, position: DVec3) -> Result<bool, TileKey> {
+        let Some((number, cell, _)) = self.cell_at([position.x, position.y]) else {
+            return Ok(false);
+        };
+        let highest = self.index().entry(tile_key(number, cell)).map(|entry| entry.max);
+        if highest.is_some_and(|highest| position.z > f64::from(highest)) {
+            return Ok(false);
+        }
+        let height = self.height_at([position.x, position.y])?;
+        Ok(height.is_some_and(|height| position.z <= height))
+    }
+
+    /// Height of the surface at a place, metres, `None` over a void and outside; the key
+    /// of the tile that is needed to tell if it is not loaded.
+    pub(crate) fn height_at(&self, at: [f64; 2]) -> Result<Option<f64>, TileKey> {
+        let Some((number, cell, [x, y])) = self.cell_at(at) else { return Ok(None) };
+        let key = tile_key(number, cell);
+        match self.ground(key) {
+            Ground::Absent => Err(key),
+            Ground::Void => Ok(None),
+            Ground::Loaded(tile) => Ok(corners_in(tile, cell).map(|corners| corners.height(x, y))),
+        }
+    }
+
+    /// The layer that holds at a place, its cell there, and where in the cell.
+    pub(crate) fn cell_at(&self, at: [f64; 2]) -> Option<(usize, [i32; 2], [f64; 2])> {
         let holds = |layer: &Layer| {
             let far = layer.far_corner();
-            let within = |axis: usize| (layer.origin[axis]..=far[axis]).contains(&position[axis]);
+            let within = |axis: usize| (layer.origin[axis]..=far[axis]).contains(&at[axis]);
             !cells_of(layer).contains(&0) && within(0) && within(1)
         };
         let layers = self.index().layers_of(LayerKind::Height);
-        let owner = layers.filter(|(_, layer)| holds(layer)).last();
-        let Some((number, layer)) = owner else { return Ok(false) };
+        let (number, layer) = layers.filter(|(_, layer)| holds(layer)).last()?;
         let cells = cells_of(layer);
         let place =
-            [0, 1].map(|axis| (position[axis] - layer.origin[axis]) * (1.0 / layer.spacing[axis]));
+            [0, 1].map(|axis| (at[axis] - layer.origin[axis]) * (1.0 / layer.spacing[axis]));
         let cell = [0, 1].map(|axis| (place[axis].floor() as i32).clamp(0, cells[axis] - 1));
-        let key = tile_key(number, cell);
-        let highest = layer.entry(0, key.tx, key.ty).map_or(f32::INFINITY, |entry| entry.max);
-        if position.z > f64::from(highest) {
-            return Ok(false);
-        }
-        match self.ground(key) {
-            Ground::Absent => Err(key),
-            Ground::Void => Ok(false),
-            Ground::Loaded(tile) => {
-                let [x, y] = [0, 1].map(|axis| place[axis] - f64::from(cell[axis]));
-                Ok(corners_in(tile, cell).is_some_and(|corners| position.z <= corners.height(x, y)))
-            }
-        }
+        Some((number, cell, [0, 1].map(|axis| place[axis] - f64::from(cell[axis]))))
     }
 }
 

@@ -14,15 +14,20 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod one;
+mod two;
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx2::Eight;
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx512::Sixteen;
 pub(crate) use one::One;
+pub(crate) use two::Two;
 
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 use std::sync::OnceLock;
+
+/// The most lanes of any width.
+pub(crate) const MOST: usize = 32;
 
 /// A width: the types of its vectors.
 pub(crate) trait Lanes: Copy + 'static {

@@ -19,7 +19,8 @@
 //! `reference` walks from cell to cell, `exact` finds the same contacts by skipping what
 //! lies below the ray, with maxima from [`Pyramid`], and `beam` spares it the way that all
 //! rays through a square of pixels clear; `field` says which layer holds
-//! where; `progress` turns a region into rays and `shade` contacts into colours.
+//! where; `progress` turns a region into rays and `shade` contacts into colours. [`meter`] measures
+//! how far an answer is from that of `exact`.
 //!
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
 //! multiplication is used in anything that ends in a pixel.
@@ -31,6 +32,7 @@ mod exact;
 mod field;
 mod grid;
 mod lanes;
+pub mod meter;
 #[cfg(test)]
 mod oracle;
 mod path;

@@ -14,10 +14,10 @@
 //! where a line crosses the grid is one expression, a cell's answer depends on nothing but
 //! the cell, and a block is passed only with more room than all rounding takes.
 
-use crate::lanes::{Floats, Ints, Lanes, Mask};
+use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use crate::relief::{Relief, Soil};
 use terrafarm_terrain::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
-use terrafarm_terrain::tile::{Codes, HeightTile, Heights, MAXIMA_LEVELS, VOID};
+use terrafarm_terrain::tile::{Codes, Floats as Floats32, HeightTile, Heights, MAXIMA_LEVELS, VOID};
 
 /// How far above a block's maximum a ray must stay to pass it: metres, and a share of its
 /// height over or under the camera. Rounding is an eighth of that.
@@ -285,9 +285,9 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
 
     #[inline(always)]
     fn plot_of(&self, lane: usize) -> i32 {
-        let mut plots = [0; 16];
+        let mut plots = [0; MOST];
         self.plot.store(&mut plots);
-        plots[lane & 15]
+        plots[lane & (MOST - 1)]
     }
 
     /// Writes the answers of lanes; these go on with their next rays.
@@ -344,10 +344,13 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     fn cross(&mut self, number: i32, level: u32, tile: &HeightTile, here: L::M, met: &mut [f32]) {
         match tile.heights() {
             Heights::Codes(codes) => {
-                let soil = Coded::new(codes, self.relief.eye_z);
-                self.cross_soil(number, level, &soil, here, met);
+                let tile = Coded::new(codes, self.relief.eye_z);
+                self.cross_tile(number, level, &tile, here, met);
             }
-            Heights::Floats(_) => self.pass_plot(number, here),
+            Heights::Floats(floats) => {
+                let tile = Plain::new(floats, self.relief.eye_z);
+                self.cross_tile(number, level, &tile, here, met);
+            }
         }
     }
 
@@ -356,11 +359,11 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     /// A lane either has a cell before it whose contact with its ray is to be found, or is
     /// on its way to the next such cell. What most lanes wait for is done first.
     #[inline(always)]
-    fn cross_soil(
+    fn cross_tile(
         &mut self,
         number: i32,
         level: u32,
-        soil: &Coded,
+        tile: &impl Tile,
         here: L::M,
         met: &mut [f32],
     ) {
@@ -448,7 +451,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let _ = along_x;
             if blocks.any() {
                 self.steps += u64::from(blocks.count());
-                let highest = soil.maximum::<L>(block, within, blocks);
+                let highest = tile.maximum::<L>(maximum::<L>(within, block), blocks);
                 let lowest = self.slopes.height(self.free).min(self.slopes.height(out))
                     - L::F::splat(0.25) * self.slopes.bend(out - self.free, out);
                 let room = L::F::splat(CLEARANCE_M) + lowest.abs() * L::F::splat(CLEARANCE_SHARE);
@@ -458,7 +461,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             }
             if cells.any() {
                 self.steps += u64::from(cells.count());
-                let solid = self.look(soil, cell, base, out, cells, &mut profile);
+                let solid = self.look(tile, cell, base, out, cells, &mut profile);
                 ready = ready | (cells & solid);
                 pass = pass | (cells & !solid);
             }
@@ -469,7 +472,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     #[inline(always)]
     fn look(
         &mut self,
-        soil: &Coded,
+        tile: &impl Tile,
         cell: [L::I; 2],
         level: L::I,
         end: L::F,
@@ -477,7 +480,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         profile: &mut Profile<L>,
     ) -> L::M {
         let relief = self.relief;
-        let (solid, [sw, se, nw, ne]) = soil.corners::<L>(cell, lanes);
+        let (solid, [sw, se, nw, ne]) = tile.corners::<L>(post::<L>(cell), lanes);
         let start = self.free;
         let shrink = L::F::splat(1.0).div(L::I::splat(1).shl(level).to_floats());
         let x0 = self.share(relief, 0, cell[0], level, shrink, start);
@@ -513,12 +516,29 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     }
 }
 
-/// A tile of codes, with heights over the camera.
+/// A tile as kernels read it; heights are over the camera.
+trait Tile {
+    /// Highest ground of blocks, 0 being the first block of their level; level from 1.
+    fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F;
+    /// Posts at and east of, and north of both, a place in the tile; and whether all four
+    /// are there.
+    fn corners<L: Lanes>(&self, at: L::I, lanes: L::M) -> (L::M, [L::F; 4]);
+}
+
+/// A tile of codes.
 struct Coded<'a> {
     posts: &'a [u16],
     maxima: &'a [u16],
     base: f32,
     step: f32,
+}
+
+/// A tile of heights as they are, as bits.
+struct Plain<'a> {
+    posts: &'a [u32],
+    maxima: &'a [u32],
+    /// Height of the camera, in two parts.
+    eye: [f32; 2],
 }
 
 impl<'a> Coded<'a> {
@@ -531,44 +551,98 @@ impl<'a> Coded<'a> {
         }
     }
 
-    /// Highest ground of blocks; `block` from 1.
     #[inline(always)]
-    fn maximum<L: Lanes>(&self, block: L::I, within: [L::I; 2], lanes: L::M) -> L::F {
-        // A tile has `1 << bits` blocks along a side. The levels of maxima lie one after
-        // another, so those of this one begin behind (4^8 - 4^(bits + 1)) / 3 others; the
-        // product is that third to the last unit.
-        let (one, bits) = (L::I::splat(1), L::I::splat(MAXIMA_LEVELS as i32) - block);
-        let mask = one.shl(bits) - one;
-        let before = L::I::splat(1 << (2 * MAXIMA_LEVELS)) - one.shl(bits + bits + one + one);
-        let start = before.times(L::I::splat(0x5556)).shr(L::I::splat(16));
-        let at = start + (within[1] & mask).shl(bits) + (within[0] & mask);
-        let code = L::I::gather_pairs(self.maxima, at, lanes) & L::I::splat(0xFFFF);
+    fn height<L: Lanes>(&self, code: L::I) -> L::F {
         L::F::splat(self.base) + code.to_floats() * L::F::splat(self.step)
     }
+}
 
-    /// Corners of cells: south-west, south-east, north-west, north-east; and whether all
-    /// four are there.
+impl Tile for Coded<'_> {
     #[inline(always)]
-    fn corners<L: Lanes>(&self, cell: [L::I; 2], lanes: L::M) -> (L::M, [L::F; 4]) {
-        let mask = L::I::splat(TILE_CELLS as i32 - 1);
-        let ring = L::I::splat(TILE_RING as i32);
+    fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F {
+        self.height::<L>(L::I::gather_pairs(self.maxima, at, lanes) & L::I::splat(0xFFFF))
+    }
+
+    #[inline(always)]
+    fn corners<L: Lanes>(&self, at: L::I, lanes: L::M) -> (L::M, [L::F; 4]) {
         let width = L::I::splat(TILE_POSTS as i32);
-        let at = ((cell[1] & mask) + ring).times(width) + (cell[0] & mask) + ring;
         let south = L::I::gather_pairs(self.posts, at, lanes);
         let north = L::I::gather_pairs(self.posts, at + width, lanes);
-        let low = L::I::splat(0xFFFF);
-        let sixteen = L::I::splat(16);
-        let codes = [
-            south & low,
-            south.shr(sixteen) & low,
-            north & low,
-            north.shr(sixteen) & low,
+        let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
+        let (sw, se) = (south & low, south.shr(sixteen) & low);
+        let (nw, ne) = (north & low, north.shr(sixteen) & low);
+        let highest = sw.max(se).max(nw.max(ne));
+        let heights = [
+            self.height::<L>(sw),
+            self.height::<L>(se),
+            self.height::<L>(nw),
+            self.height::<L>(ne),
         ];
-        let void = L::I::splat(i32::from(VOID));
-        let highest = codes[0].max(codes[1]).max(codes[2].max(codes[3]));
-        let height = |code: L::I| {
-            L::F::splat(self.base) + code.to_floats() * L::F::splat(self.step)
-        };
-        (highest.lt(void), [height(codes[0]), height(codes[1]), height(codes[2]), height(codes[3])])
+        (highest.lt(L::I::splat(i32::from(VOID))), heights)
     }
+}
+
+impl<'a> Plain<'a> {
+    fn new(floats: Floats32<'a>, eye_z: f64) -> Self {
+        let high = eye_z as f32;
+        Plain {
+            posts: as_bits(floats.posts),
+            maxima: as_bits(floats.maxima),
+            eye: [high, (eye_z - f64::from(high)) as f32],
+        }
+    }
+
+    #[inline(always)]
+    fn height<L: Lanes>(&self, table: &[u32], at: L::I, lanes: L::M) -> L::F {
+        let height = L::F::from_bits(L::I::gather(table, at, lanes));
+        height - L::F::splat(self.eye[0]) - L::F::splat(self.eye[1])
+    }
+}
+
+impl Tile for Plain<'_> {
+    #[inline(always)]
+    fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F {
+        self.height::<L>(self.maxima, at, lanes)
+    }
+
+    #[inline(always)]
+    fn corners<L: Lanes>(&self, at: L::I, lanes: L::M) -> (L::M, [L::F; 4]) {
+        let one = L::I::splat(1);
+        let north = at + L::I::splat(TILE_POSTS as i32);
+        let sw = self.height::<L>(self.posts, at, lanes);
+        let se = self.height::<L>(self.posts, at + one, lanes);
+        let nw = self.height::<L>(self.posts, north, lanes);
+        let ne = self.height::<L>(self.posts, north + one, lanes);
+        // A void is NaN, and so is the sum.
+        let sum = sw + se + nw + ne;
+        (sum.le(sum), [sw, se, nw, ne])
+    }
+}
+
+/// Floats as the bits that they are.
+pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
+    // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
+    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
+}
+
+/// Place of cells among the posts of their tile.
+#[inline(always)]
+fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
+    let mask = L::I::splat(TILE_CELLS as i32 - 1);
+    let ring = L::I::splat(TILE_RING as i32);
+    let row = (cell[1] & mask) + ring;
+    row.times(L::I::splat(TILE_POSTS as i32)) + (cell[0] & mask) + ring
+}
+
+/// Place of blocks of `1 << level` cells among the maxima of their tile; level from 1.
+#[inline(always)]
+fn maximum<L: Lanes>(block: [L::I; 2], level: L::I) -> L::I {
+    // A tile has `1 << bits` blocks along a side. The levels of maxima lie one after
+    // another, so those of this one begin behind (4^8 - 4^(bits + 1)) / 3 others; the
+    // product is that third to the last unit.
+    let (one, bits) = (L::I::splat(1), L::I::splat(MAXIMA_LEVELS as i32) - level);
+    let mask = one.shl(bits) - one;
+    let before = L::I::splat(1 << (2 * MAXIMA_LEVELS)) - one.shl(bits + bits + one + one);
+    let start = before.times(L::I::splat(0x5556)).shr(L::I::splat(16));
+    start + (block[1] & mask).shl(bits) + (block[0] & mask)
 }

@@ -66,12 +66,13 @@ fn values_are_taken_over() {
         fps = 29.97
         samples = 4
         method = "reference"
+        tolerance = 2
     "##;
     let scene = parsed(text).unwrap();
     assert_eq!((scene.size, scene.hfov_deg, scene.fps), ((640, 480), 45.0, 29.97));
     assert_eq!(
         scene.quality,
-        Quality { method: Method::Reference, samples_per_side: 4, ..Quality::default() }
+        Quality { method: Method::Reference, samples_per_side: 4, tolerance_px: 2.0 }
     );
     assert_eq!(scene.sky, Sky { zenith: [0.0; 3], ..Sky::default() });
     let shading = scene.shading(Some(6.37e6), 0.0).unwrap();
@@ -139,6 +140,17 @@ fn a_mistake_is_reported_with_its_line() {
         ("[output]\nsamples = 1.5", "s.toml:3: [output] samples is a whole number"),
         ("[output]\nsamples = 33", "s.toml:3: [output] samples = 33 is out of range"),
         ("[output]\nmethod = \"fast\"", "s.toml:3: unknown method \"fast\"; choose one of"),
+        ("[output]\nmethod = \"exat\"", "did you mean \"exact\"?"),
+        (
+            "[output]\ntolerance = 0",
+            "s.toml:3: [output] tolerance = 0 is out of range; it may be 0.01 to 64",
+        ),
+        ("[output]\ntolerance = -1", "s.toml:3: [output] tolerance = -1 is out of range"),
+        ("[output]\ntolerance = nan", "s.toml:3: [output] tolerance = NaN is out of range"),
+        ("[output]\ntolerance = inf", "s.toml:3: [output] tolerance = inf is out of range"),
+        ("[output]\ntolerance = 64.5", "s.toml:3: [output] tolerance = 64.5 is out of range"),
+        ("[output]\ntolerance = 0.001", "s.toml:3: [output] tolerance = 0.001 is out of range"),
+        ("[output]\ntolerance = \"half\"", "s.toml:3: invalid type: string"),
         ("[output]\nfsp = 5", "s.toml:3: unknown field `fsp`, expected one of `fps`"),
         ("[clouds]", "s.toml:2: unknown field `clouds`"),
         ("terrain = \"b\"", "s.toml:2: duplicate key"),

@@ -5,7 +5,7 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask};
+use super::{Floats, Ints, Kernel, Lanes, Mask, Two};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 

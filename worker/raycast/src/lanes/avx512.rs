@@ -2,7 +2,7 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask};
+use super::{Floats, Ints, Kernel, Lanes, Mask, Two};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
