@@ -366,7 +366,8 @@ pub struct BenchCore {
         value_parser = clap::value_parser!(u32).range(65..=32_769))]
     pub posts: Vec<u32>,
     /// Methods, with commas
-    #[arg(long, value_delimiter = ',', default_value = "exact,lod,column,frustum,voxel")]
+    #[arg(long, value_delimiter = ',', default_value = "exact,lod,column,frustum,voxel",
+        value_parser = parse_method)]
     pub methods: Vec<Method>,
     /// Tolerance of the methods that have one, pixels
     #[arg(long, value_name = "PX", value_parser = parse_tolerance,
@@ -412,14 +413,6 @@ pub struct BenchStability {
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
-}
-
-fn parse_tolerance(text: &str) -> Result<f64, String> {
-    let range = Quality::MIN_TOLERANCE_PX..=Quality::MAX_TOLERANCE_PX;
-    text.parse()
-        .ok()
-        .filter(|px| range.contains(px))
-        .ok_or_else(|| format!("write a number of pixels, {} to {}", range.start(), range.end()))
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {

@@ -79,7 +79,7 @@ struct Case {
     error_px_p50: Option<f64>,
     error_px_p99: Option<f64>,
     error_px_max: Option<f64>,
-    /// Share of the pixels that are sky instead of ground or the other way round.
+    /// Share of the pixels that show another cell than is there, sky counted as one.
     mismatch: Option<f64>,
     /// Memory of the terrain, all levels, per post of level 0.
     bytes_per_post: f64,

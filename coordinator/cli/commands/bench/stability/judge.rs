@@ -4,7 +4,7 @@ use super::Cell;
 use super::scenes::{Scene, Truth};
 use crate::commands::bench::kernel::{self, Depths};
 use crate::commands::bench::report::{Promise, Spread};
-use terrafarm_common::quality::Quality;
+use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_raycast::View;
 
@@ -94,12 +94,15 @@ fn edge_error(view: &View, answer: &Depths, row_px: f64) -> f64 {
     ((f64::from(first) - row_px).abs() - 0.5).max(0.0)
 }
 
+/// Errors by the accuracy meter; those of `exact`, which the meter relies on, against the
+/// reference.
 fn surface_spread(scene: &Scene, view: &View, answer: &Depths) -> Result<Spread, kernel::Refusal> {
     let frame = Region::whole(view.camera.width, view.camera.height);
-    let mut errors = kernel::errors(&scene.land, view, frame, answer)?;
-    let confused = std::iter::repeat_n(f64::INFINITY, errors.mismatched);
-    errors.error_px.extend(confused);
-    Ok(Spread::of(errors.error_px))
+    let errors = match view.quality.method {
+        Method::Exact => kernel::from_reference(&scene.land, view, answer)?,
+        _ => kernel::errors(&scene.land, view, frame, answer)?.error_px,
+    };
+    Ok(Spread::of(errors))
 }
 
 /// A plane over a rectangle.

@@ -78,7 +78,11 @@ fn view(pose: Pose, size: (u32, u32), earth: Option<Earth>) -> View {
     View { camera, shading, quality: Quality::default() }
 }
 
-fn made(name: &str, spec: LayerSpec, rule: impl Fn(u64, u64) -> f32 + Sync) -> anyhow::Result<Land> {
+fn made(
+    name: &str,
+    spec: LayerSpec,
+    rule: impl Fn(u64, u64) -> f32 + Sync,
+) -> anyhow::Result<Land> {
     Land::made(name, None, spec, &Rule(rule))
 }
 
@@ -127,12 +131,20 @@ fn planes(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
     let seam = 256.0 * SPACING_M;
     let at_seam = [seam, seam, 600.0];
     let poses = [
-        ("eye over a post, rays along a grid line", square, look([1000.0, 500.0, 500.0], 0.0, -20.0)),
+        (
+            "eye over a post, rays along a grid line",
+            square,
+            look([1000.0, 500.0, 500.0], 0.0, -20.0),
+        ),
         ("rays through corners of cells", square, look([1000.0, 1000.0, 500.0], 45.0, -20.0)),
         ("seam of tiles", square, look([seam, 1000.0, 500.0], 0.0, -15.0)),
         ("seam of levels, straight down", square, look(at_seam, 0.0, -90.0)),
         ("roll 90 over a plane", square, Pose { roll: 90.0, ..look(at_seam, 10.0, -30.0) }),
-        ("field of view 170 over a plane", square, Pose { hfov: 170.0, ..look(at_seam, 10.0, -50.0) }),
+        (
+            "field of view 170 over a plane",
+            square,
+            Pose { hfov: 170.0, ..look(at_seam, 10.0, -50.0) },
+        ),
         ("5000 km from the origin", utm, look([501_000.01, 5_001_000.01, 215.0], 33.0, -15.0)),
         ("posts three times as far along x", long, look([3000.0, 1000.0, 500.0], 60.0, -20.0)),
     ];
@@ -161,8 +173,8 @@ fn edges(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
 
     let (eye, peak) = (2000.0, 9000.0);
     let arc = ridge_m / radius;
-    let tangent_far = ((radius + peak) * libm::cos(arc) - (radius + eye))
-        / ((radius + peak) * libm::sin(arc));
+    let tangent_far =
+        ((radius + peak) * libm::cos(arc) - (radius + eye)) / ((radius + peak) * libm::sin(arc));
     let drop = -libm::tan(libm::acos(radius / (radius + 100.0)));
     let mut scenes = Vec::new();
     let mut add = |name, land: Land, pose, earth, tangent| {
@@ -171,7 +183,13 @@ fn edges(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
         scenes.push(Scene { name, land, view, truth });
     };
     let half = 51_200.0;
-    add("sea to the horizon", made("sea", sea, |_, _| 0.0)?, level([half, half, 100.0]), Some(earth), drop);
+    add(
+        "sea to the horizon",
+        made("sea", sea, |_, _| 0.0)?,
+        level([half, half, 100.0]),
+        Some(earth),
+        drop,
+    );
     let ridge = made("ridge", far, |_, j| if j == 350 { 9000.0 } else { 0.0 })?;
     let before = [32_000.0, 350_000.0 - ridge_m, eye];
     add("peak at 300 km", ridge, level(before), Some(earth), tangent_far);
@@ -198,8 +216,16 @@ fn odd_grounds(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
         ("one row of posts", made("row", square([300, 1]), hills)?, down(100.0, -300.0)),
         ("one post", made("post", square([1, 1]), hills)?, down(0.0, -300.0)),
         ("two by two posts", made("four", square([2, 2]), hills)?, down(5.0, -300.0)),
-        ("sizes beside a power of two", made("odd", square([258, 259]), hills)?, down(1000.0, 200.0)),
-        ("below the datum", made("low", square([300; 2]), move |i, j| hills(i, j) - 790.0)?, down(1000.0, 200.0)),
+        (
+            "sizes beside a power of two",
+            made("odd", square([258, 259]), hills)?,
+            down(1000.0, 200.0),
+        ),
+        (
+            "below the datum",
+            made("low", square([300; 2]), move |i, j| hills(i, j) - 790.0)?,
+            down(1000.0, 200.0),
+        ),
         ("all heights equal", made("flat", square([300; 2]), |_, _| 300.0)?, down(1000.0, 200.0)),
     ];
     let scene = |(name, land, pose)| Scene {

@@ -30,7 +30,8 @@ fn keyframe(t_s: f64, x: f64, pitch_deg: f64, heading_deg: f64) -> Keyframe {
 
 /// Duplicate keyframes, cuts and hovers: no pose may be NaN.
 fn odd_times() -> anyhow::Result<Cell> {
-    let times = [(0.0, 0.0), (1.0, 5.0), (1.0, 5.0), (1.0, 9.0), (2.0, 9.0), (3.0, 9.0), (4.0, 1.0)];
+    let times =
+        [(0.0, 0.0), (1.0, 5.0), (1.0, 5.0), (1.0, 9.0), (2.0, 9.0), (3.0, 9.0), (4.0, 1.0)];
     let flight = Flight::new(times.map(|(t, x)| keyframe(t, x, -10.0, 30.0)).to_vec())?;
     let odd = (0..=POSES).filter(|step| {
         let pose = flight.pose_at(4.0 * f64::from(*step) / f64::from(POSES));
@@ -43,8 +44,11 @@ fn odd_times() -> anyhow::Result<Cell> {
 /// From one horizon to the other by way of straight down: 180 degrees in 2 seconds, turned
 /// evenly. An interpolation of angles would spin at the nadir.
 fn through_the_zenith() -> anyhow::Result<Cell> {
-    let keyframes =
-        vec![keyframe(0.0, 0.0, 0.0, 0.0), keyframe(1.0, 0.0, -90.0, 0.0), keyframe(2.0, 0.0, 0.0, 180.0)];
+    let keyframes = vec![
+        keyframe(0.0, 0.0, 0.0, 0.0),
+        keyframe(1.0, 0.0, -90.0, 0.0),
+        keyframe(2.0, 0.0, 0.0, 180.0),
+    ];
     let roll = keyframes[2].attitude;
     let flight = Flight::new(keyframes)?;
     let pose = |step: u32| flight.pose_at(2.0 * f64::from(step) / f64::from(POSES)).attitude;
