@@ -76,6 +76,7 @@ pub fn run(args: &args::BenchStability) -> anyhow::Result<Outcome> {
         for method in Method::ALL {
             let tolerance_px = Quality::DEFAULT_TOLERANCE_PX;
             let quality = Quality { method, samples_per_side: 1, tolerance_px };
+            tracing::info!(scene = scene.name, method = method.name(), "next");
             report.cells.push(judge::cell(&scene, quality));
         }
         // What is done stays known, whatever happens to the rest.
