@@ -26,6 +26,10 @@ mod commands;
 #[path = "whole/bench.rs"]
 mod bench;
 
+/// Two pictures and how far they are apart, against other programs.
+#[path = "whole/compare.rs"]
+mod compare;
+
 /// Every command in the documents is one that works.
 #[path = "whole/documents.rs"]
 mod documents;

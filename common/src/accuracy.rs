@@ -7,6 +7,7 @@
 //! maxima are exact always; quantiles are those of the kept values.
 
 use crate::stats::quantile;
+use std::str::FromStr;
 
 /// Errors above this are not told apart, pixels: 64 stands for 64 and more.
 pub const ERROR_MAX_PX: f64 = 64.0;
@@ -185,6 +186,50 @@ fn spread(values: impl Iterator<Item = f64>, max: f64) -> Option<Spread> {
     Some(Spread { p50: quantile(&sorted, 0.5)?, p99: quantile(&sorted, 0.99)?, max })
 }
 
+/// What share of the pixels of a picture is measured, in millionths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Share(u32);
+
+impl Share {
+    /// No pixel.
+    pub const NONE: Share = Share(0);
+    /// Every pixel, in millionths.
+    const WHOLE: u32 = 1_000_000;
+
+    /// A share in millionths; `None` beyond all.
+    pub fn from_millionths(millionths: u32) -> Option<Self> {
+        (millionths <= Self::WHOLE).then_some(Share(millionths))
+    }
+
+    /// The share in millionths.
+    pub fn millionths(self) -> u32 {
+        self.0
+    }
+
+    /// Whether the pixel of a number, see [`pixel_number`], is among those measured. The
+    /// pixels of a share are among those of every larger one.
+    pub fn takes(self, number: u32) -> bool {
+        (u64::from(number) * u64::from(Self::WHOLE)) >> 32 < u64::from(self.0)
+    }
+}
+
+impl FromStr for Share {
+    type Err = String;
+
+    /// Reads a percentage: `1%`, `0.1%`, `1`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = text.strip_suffix('%').unwrap_or(text).trim().parse::<f64>().ok();
+        let per_percent = f64::from(Self::WHOLE) / 100.0;
+        let fits = |percent: &f64| *percent == 0.0 || (1.0 / per_percent..=100.0).contains(percent);
+        number.filter(fits).map(|percent| Share((percent * per_percent).round() as u32)).ok_or_else(
+            || {
+                "write the share of pixels to check as 0.0001% to 100%, such as 1%; 0 for none"
+                    .into()
+            },
+        )
+    }
+}
+
 /// A number of a pixel that looks random: the same on every PC and for every split. By
 /// the finaliser of splitmix64.
 pub fn pixel_number(frame: u32, x: u32, y: u32) -> u32 {
@@ -242,6 +287,39 @@ mod tests {
         }
         let (one, other) = (low(0), low(1));
         assert!(one.iter().filter(|pixel| other.contains(pixel)).count() < 200);
+    }
+
+    #[test]
+    fn shares_are_percentages_and_those_that_are_none_are_refused() {
+        for (text, millionths) in [
+            ("1%", 10_000),
+            ("0.1%", 1000),
+            ("1", 10_000),
+            ("100 %", 1_000_000),
+            ("0", 0),
+            ("0%", 0),
+            ("1e-4", 1),
+        ] {
+            assert_eq!(text.parse::<Share>().unwrap().millionths(), millionths, "{text}");
+        }
+        for wrong in ["", "%", "-1%", "101%", "nan", "inf", "1%%", "all", "1e-5", "1 000"] {
+            let error = wrong.parse::<Share>().unwrap_err();
+            assert!(error.contains("0.0001% to 100%"), "{wrong}: {error}");
+        }
+        assert_eq!(Share::from_millionths(1_000_001), None);
+    }
+
+    #[test]
+    fn a_share_takes_about_as_many_pixels_as_it_says() {
+        let count = |share: &str| {
+            let share: Share = share.parse().unwrap();
+            let pixels = (0..200u32).flat_map(|y| (0..500u32).map(move |x| (x, y)));
+            pixels.filter(|(x, y)| share.takes(pixel_number(3, *x, *y))).count()
+        };
+        assert_eq!((count("0"), count("100%")), (0, 100_000));
+        assert!((900..1100).contains(&count("1%")), "{}", count("1%"));
+        assert!(Share::from_millionths(1_000_000).unwrap().takes(u32::MAX));
+        assert!(!Share::NONE.takes(0));
     }
 
     proptest! {

@@ -6,6 +6,7 @@
 
 pub mod accuracy;
 pub mod camera;
+pub mod compare;
 pub mod flight;
 pub mod id;
 pub mod image;

@@ -4,6 +4,7 @@ use crate::input::{parse_method, parse_tolerance};
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
 
@@ -35,6 +36,8 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Render for a coordinator until told to stop
     Worker(Worker),
+    /// Say how far two pictures, or two folders of numbered pictures, are apart
+    Compare(Compare),
     /// Run the real scheduler on a virtual clock, with workers that fail
     Simulate(Simulate),
     /// Measure speed, accuracy and stability of the methods; exit code 1 if one is wrong
@@ -73,6 +76,10 @@ pub struct Casting {
     /// scene's, else 0.5]
     #[arg(long, value_parser = parse_tolerance, value_name = "PX", allow_negative_numbers = true)]
     pub tolerance: Option<f64>,
+    /// Measure a random share of the pixels against exact, such as 1%: error in pixels,
+    /// per frame in the manifest
+    #[arg(long, value_name = "PERCENT", default_value = "0", allow_negative_numbers = true)]
+    pub check: Share,
 }
 
 /// `terrafarm terrain ...`
@@ -316,6 +323,21 @@ pub struct Worker {
     /// End when the coordinator goes away instead of waiting for it
     #[arg(long)]
     pub once: bool,
+}
+
+/// `terrafarm compare`
+#[derive(Debug, ClapArgs)]
+pub struct Compare {
+    /// A PNG picture, or a folder of numbered ones, or the manifest in it
+    pub one: PathBuf,
+    /// What to compare it with, of the same kind and size
+    pub other: PathBuf,
+    /// Write the differences, amplified, as a PNG; of a sequence, those of the worst pair
+    #[arg(long, value_name = "FILE")]
+    pub difference: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `terrafarm simulate`

@@ -5,7 +5,7 @@ use crate::input::flight::{Bounds, Place};
 use anyhow::Context;
 use std::cell::RefCell;
 use terrafarm_geo::Crs;
-use terrafarm_terrain::info::summary;
+use terrafarm_terrain::info::bounds;
 use terrafarm_terrain::sample::height_at;
 use terrafarm_terrain::store::{StoreError, StoreReader};
 
@@ -24,8 +24,8 @@ impl<'a> StorePlace<'a> {
         let crs = Crs::parse(&store.index().crs).with_context(|| {
             format!("{}: cannot use its reference system", store.path().display())
         })?;
-        let info = summary(store);
-        let bounds = Bounds { min: info.min, max: info.max };
+        let [min, max] = bounds(store.index());
+        let bounds = Bounds { min, max };
         Ok(StorePlace { store, crs, bounds, broken: RefCell::new(None) })
     }
 

@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex};
 use terrafarm_common::image::Rgb8;
@@ -50,6 +51,8 @@ pub struct Plan {
     pub shading: Shading,
     /// Method, tolerance and samples.
     pub quality: Quality,
+    /// What share of the pixels is measured.
+    pub check: Share,
     /// How frames are cut into jobs.
     pub split: Split,
     /// Index of the first camera within the flight.
@@ -129,6 +132,7 @@ impl Plan {
             flight: choice.flight.to_owned(),
             shading,
             quality: scene.quality,
+            check: Share::NONE,
             split: Split::Columns,
             first_frame: first,
             cameras,
@@ -159,6 +163,8 @@ pub struct Report {
     pub manifest_path: PathBuf,
     /// Its content.
     pub manifest: Manifest,
+    /// The errors of the pixels that were measured, all frames together.
+    pub errors: Option<Summary>,
     /// Wall time, seconds.
     pub seconds: f64,
 }
@@ -217,6 +223,8 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         poster: plan.poster.clone(),
         bar: bar.clone(),
         first_sign: Some(first_sign),
+        workers: 0,
+        worst_p99_px: None,
     };
     let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), address.clone()));
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
@@ -225,6 +233,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         store: plan.store.clone(),
         shading: plan.shading.clone(),
         quality: plan.quality,
+        check: plan.check,
         split: plan.split,
         cameras: plan.cameras.clone(),
         frames_in_flight: plan.frames_in_flight,
@@ -250,7 +259,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let written = writing.await.context("the task that writes frames ended early")?;
     bar.finish_and_clear();
     // What went wrong with a file is the cause; that the shot then stopped is not.
-    let Written { finished, records, failed } = match (written, &rendered) {
+    let Written { finished, records, errors, failed } = match (written, &rendered) {
         (Ok(written), _) => written,
         (Err(why), Ok(_) | Err(ClientError::Stopped)) => return Err(why),
         (Err(_), Err(_)) => Written::default(),
@@ -284,7 +293,8 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
             .collect(),
     };
     let manifest_path = manifest.save(&finished.output)?;
-    Ok(Report { finished, manifest_path, manifest, seconds: started.elapsed().as_secs_f64() })
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Report { finished, manifest_path, manifest, errors, seconds })
 }
 
 /// A farm without workers looks like a slow one: tells the user which it is.
@@ -307,12 +317,16 @@ struct Desk {
     bar: ProgressBar,
     /// Told once, when anything comes back.
     first_sign: Option<oneshot::Sender<()>>,
+    workers: u32,
+    /// The largest 99th percentile of the errors of a frame so far, pixels.
+    worst_p99_px: Option<f64>,
 }
 
 #[derive(Default)]
 struct Written {
     finished: Option<Finished>,
     records: Vec<FrameEntry>,
+    errors: Option<Summary>,
     failed: BTreeMap<FrameIndex, String>,
 }
 
@@ -331,7 +345,8 @@ impl Desk {
             }
             match update {
                 Update::Progress(progress) => {
-                    self.bar.set_message(format!("on {} workers", progress.workers));
+                    self.workers = progress.workers;
+                    self.say();
                 }
                 Update::Frame(index, picture, facts) => order.put(index, Some((picture, facts)))?,
                 Update::FrameFailed(index, reason) => {
@@ -355,8 +370,14 @@ impl Desk {
         Ok(written)
     }
 
+    /// Says on the bar who works, and how wrong the pictures are.
+    fn say(&self) {
+        let checked = self.worst_p99_px.map(|px| format!(", error p99 up to {px:.2} px"));
+        self.bar.set_message(format!("on {} workers{}", self.workers, checked.unwrap_or_default()));
+    }
+
     fn put(
-        &self,
+        &mut self,
         sink: &mut dyn FrameSink,
         index: FrameIndex,
         frame: Option<(Rgb8, FrameFacts)>,
@@ -372,6 +393,14 @@ impl Desk {
         {
             sink::poster::save(path, &picture)?;
         }
+        let errors = facts.check.as_ref();
+        let error_px = errors.and_then(Summary::error_px);
+        if let Some(errors) = errors {
+            written.errors.get_or_insert_default().merge(errors);
+            let p99_px = error_px.map(|error| error.p99);
+            self.worst_p99_px = p99_px.into_iter().chain(self.worst_p99_px).reduce(f64::max);
+            self.say();
+        }
         written.records.push(FrameEntry {
             index: self.first + index,
             sha256: sink::pixels_sha256(&picture).to_hex(),
@@ -379,8 +408,11 @@ impl Desk {
             render_ms: facts.cost_us as f64 / 1e3,
             jobs: facts.jobs,
             below_ground: facts.below_ground,
-            error_px_p99: None,
-            mismatch: None,
+            error_px_p99: error_px.map(|error| error.p99),
+            error_px_max: error_px.map(|error| error.max),
+            depth_error_m_p99: errors.and_then(Summary::depth_m).map(|depth| depth.p99),
+            mismatch: error_px.and(errors).map(Summary::mismatch),
+            checked_pixels: errors.map(Summary::samples),
         });
         Ok(())
     }

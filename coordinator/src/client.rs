@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use std::sync::Arc;
 use std::time::Duration;
+use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use terrafarm_common::image::Rgb8;
@@ -39,8 +40,10 @@ pub struct Submission {
     pub store: Arc<StoreReader>,
     /// Light, air and sky.
     pub shading: Shading,
-    /// Method and samples.
+    /// Method, tolerance and samples.
     pub quality: Quality,
+    /// What share of the pixels is to be measured.
+    pub check: Share,
     /// How frames are cut into jobs.
     pub split: Split,
     /// One camera a frame, all of one size; at least one.
@@ -61,7 +64,7 @@ pub enum Update {
 }
 
 /// What a frame took.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct FrameFacts {
     /// Number of jobs it was made of.
     pub jobs: u32,
@@ -71,6 +74,8 @@ pub struct FrameFacts {
     pub elapsed_us: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
+    /// The errors of the pixels that were measured, if any were to be.
+    pub check: Option<Summary>,
 }
 
 /// Why a shot did not come to its end.
@@ -244,6 +249,7 @@ impl Talk {
             cost_us: frame.report.cost_us,
             elapsed_us: frame.elapsed_us,
             below_ground: frame.report.below_ground,
+            check: frame.check,
         };
         Ok(Update::Frame(frame.frame, picture, facts))
     }
@@ -266,6 +272,7 @@ impl Submission {
             index,
             shading: self.shading.clone(),
             quality: self.quality,
+            check: self.check,
             width,
             height,
             split: self.split,

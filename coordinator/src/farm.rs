@@ -325,7 +325,8 @@ impl Farm {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
                 let name =
                     self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
-                self.shots.count_job(shot, frame, name, &done.report);
+                let (report, check) = (&done.report, done.check.as_ref());
+                self.shots.count_job(shot, frame, name, report, check);
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
                     tracing::error!(%shot, "cannot merge pixels: {why}");
                 }
@@ -419,6 +420,7 @@ impl Farm {
             index: state.submit.index,
             shading: state.submit.shading.clone(),
             quality: state.submit.quality,
+            check: state.submit.check,
             width: state.submit.width,
             height: state.submit.height,
         });

@@ -2,6 +2,7 @@
 
 use crate::blobs::ClientId;
 use std::collections::BTreeMap;
+use terrafarm_common::accuracy::Summary;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
@@ -66,6 +67,7 @@ pub struct OpenFrame {
     since: Micros,
     jobs: u32,
     report: RenderReport,
+    check: Option<Summary>,
     picture: Option<Rgb8>,
 }
 
@@ -216,6 +218,7 @@ impl Shots {
             since: now,
             jobs: 0,
             report: RenderReport::default(),
+            check: None,
             picture: None,
         });
         Some(state)
@@ -228,6 +231,7 @@ impl Shots {
         frame: FrameIndex,
         worker: &str,
         report: &RenderReport,
+        check: Option<&Summary>,
     ) {
         let Some(state) = self.shots.get_mut(&shot) else { return };
         state.jobs += 1;
@@ -235,6 +239,9 @@ impl Shots {
         if let Some(open) = state.open_frames.get_mut(&frame) {
             open.jobs += 1;
             add(&mut open.report, report);
+            if let Some(check) = check {
+                open.check.get_or_insert_default().merge(check);
+            }
         }
         if let Some(share) = state.shares.get_mut(worker) {
             share.jobs += 1;
@@ -281,6 +288,7 @@ impl Shots {
             frame,
             jobs: open.jobs,
             report: open.report,
+            check: open.check,
             elapsed_us: now.since(open.since),
         };
         Some((state.client, head, open.picture?))
@@ -321,20 +329,21 @@ impl Shots {
 }
 
 /// A frame's message without its pixels.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct FrameHead {
     shot: ShotId,
     frame: FrameIndex,
     jobs: u32,
     report: RenderReport,
+    check: Option<Summary>,
     elapsed_us: u64,
 }
 
 impl FrameHead {
     /// The message with its pixels.
     pub fn with(self, pixels: terrafarm_wire::pixels::Pixels) -> Frame {
-        let FrameHead { shot, frame, jobs, report, elapsed_us } = self;
-        Frame { shot, frame, jobs, report, elapsed_us, pixels }
+        let FrameHead { shot, frame, jobs, report, check, elapsed_us } = self;
+        Frame { shot, frame, jobs, report, elapsed_us, check, pixels }
     }
 }
 

@@ -185,6 +185,18 @@ fn a_tolerance_out_of_its_limits_says_what_they_are() {
 }
 
 #[test]
+fn a_share_to_check_that_is_none_says_what_it_may_be() {
+    let world = World::new(40);
+    for wrong in ["-1", "101%", "all", "nan", "1e-9", ""] {
+        let mut render = world.render();
+        let (_, stderr) = run(render.args(["--check", wrong, "-o"]).arg(world.dir.path("o")), 2);
+        assert!(stderr.contains("0.0001% to 100%"), "{wrong}: {stderr}");
+        let (_, stderr) = run(terrafarm().args(["demo", "--check", wrong]), 2);
+        assert!(stderr.contains("0.0001% to 100%"), "{wrong}: {stderr}");
+    }
+}
+
+#[test]
 fn a_coordinator_that_is_not_there_is_named() {
     let world = World::new(40);
     let (_, stderr) = run(

@@ -68,6 +68,41 @@ fn read_png(path: &Path) -> (u32, u32, Vec<u8>) {
 }
 
 #[test]
+fn a_check_measures_the_same_pixels_however_frames_are_split() {
+    let world = World::new(60);
+    let render = |name: &str, more: &[&str]| {
+        let output = world.dir.path(name);
+        let arguments = ["--size", "96x54", "--frames", "0..2", "--method", "exact"];
+        let mut command = world.render();
+        let said = succeed(command.args(arguments).args(more).arg("-o").arg(&output));
+        let manifest = fs::read(output.join("manifest.json")).unwrap();
+        (said, serde_json::from_slice::<serde_json::Value>(&manifest).unwrap())
+    };
+    let (said, plain) = render("plain", &["--workers", "1"]);
+    assert!(!said.contains("checked"), "{said}");
+    assert!(plain["frames"][0].get("error_px_p99").is_none());
+    let (said, columns) = render("columns", &["--workers", "2", "--check", "20%"]);
+    assert!(said.contains("against exact: error p50 0.000, p99 0.000, max 0.000 pixels"), "{said}");
+    let tiles = ["--workers", "1", "--check", "20%", "--split", "tiles:16"];
+    let (_, tiles) = render("tiles", &tiles);
+    for index in 0..2 {
+        let [plain, columns, tiles] = [&plain, &columns, &tiles].map(|m| &m["frames"][index]);
+        assert_eq!((&plain["sha256"], &plain["sha256"]), (&columns["sha256"], &tiles["sha256"]));
+        for key in ["error_px_p99", "error_px_max", "mismatch"] {
+            assert_eq!((&columns[key], &tiles[key]), (&0.0.into(), &0.0.into()), "{key}");
+        }
+        let count = columns["checked_pixels"].as_u64().unwrap();
+        assert!((850..1250).contains(&count), "{count} of 5184");
+        assert_eq!(tiles["checked_pixels"], count);
+    }
+    let (said, all) = render("all", &["--workers", "1", "--check", "100%", "--json"]);
+    assert_eq!(all["frames"][0]["checked_pixels"], 96 * 54);
+    let said: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said["check"]["checked_pixels"], 2 * 96 * 54);
+    assert_eq!(said["check"]["error_px"]["max"], 0.0);
+}
+
+#[test]
 fn the_slow_twin_makes_the_same_picture() {
     let world = World::new(60);
     let render = |method: &str| {

@@ -1,7 +1,8 @@
 //! One job on all cores: pieces of its region, each rendered as far as its tiles allow.
 //!
 //! A job keeps what is done of every piece, so that a pause for missing tiles repeats
-//! nothing. The stop flag is looked at before each piece: a revoked job ends within the
+//! nothing. A piece whose pixels are done has some of them measured, if the shot asks for
+//! that; tiles that only the measurement needs are waited for like others. The stop flag is looked at before each piece: a revoked job ends within the
 //! time of one piece a core. A panic of the ray caster ends the job, not the worker.
 
 use rayon::prelude::*;
@@ -11,10 +12,12 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use terrafarm_common::id::LeaseId;
+use terrafarm_common::accuracy::{PixelError, Share, Summary, pixel_number};
+use terrafarm_common::id::{FrameIndex, LeaseId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::region::{Region, tiles};
-use terrafarm_raycast::{Progress, Pyramid, Rendered, Stats, View};
+use terrafarm_raycast::meter::measure;
+use terrafarm_raycast::{Missing, Progress, Pyramid, Rendered, Stats, View, depths};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_terrain::resident::Resident;
 
@@ -45,6 +48,18 @@ pub trait Caster: Send + Sync + 'static {
 
     /// The pixels of a piece that waits for nothing.
     fn finish(&self, piece: Self::Piece) -> Rendered;
+
+    /// How wrong the answer of the view's method is for pixel (x, y).
+    ///
+    /// # Errors
+    /// The tiles that are needed to tell and are not in memory.
+    fn gauge(
+        &self,
+        scene: &Scene<Self::Prepared>,
+        view: &View,
+        x: u32,
+        y: u32,
+    ) -> Result<PixelError, Vec<TileKey>>;
 }
 
 /// The terrain as a job sees it.
@@ -78,6 +93,30 @@ impl Caster for RayCaster {
     fn finish(&self, piece: Progress) -> Rendered {
         piece.into_rendered(Vec::new())
     }
+
+    fn gauge(
+        &self,
+        scene: &Scene<Pyramid>,
+        view: &View,
+        x: u32,
+        y: u32,
+    ) -> Result<PixelError, Vec<TileKey>> {
+        let (resident, pyramid) = (&scene.resident, &scene.prepared);
+        // A pixel does not depend on the region that it is asked for in.
+        let alone = Region { x, y, width: 1, height: 1 };
+        let found = depths(resident, pyramid, view, alone).map_err(|Missing(tiles)| tiles)?;
+        let claimed = found.distance_m.first().map_or(f64::NAN, |distance| f64::from(*distance));
+        measure(resident, pyramid, view, x, y, claimed).map_err(|Missing(tiles)| tiles)
+    }
+}
+
+/// Which pixels of a frame are measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Check {
+    /// How many of them.
+    pub share: Share,
+    /// Number of the frame, for the choice.
+    pub frame: FrameIndex,
 }
 
 /// A job that has been begun.
@@ -86,6 +125,7 @@ pub struct Job<C: Caster> {
     pub lease: LeaseId,
     view: View,
     region: Region,
+    check: Check,
     pieces: Vec<Piece<C>>,
     stop: Arc<AtomicBool>,
     spent: Duration,
@@ -94,7 +134,10 @@ pub struct Job<C: Caster> {
 struct Piece<C: Caster> {
     region: Region,
     progress: C::Piece,
-    done: bool,
+    rendered: bool,
+    /// Pixels that are still to be measured.
+    unmeasured: Vec<[u32; 2]>,
+    errors: Summary,
 }
 
 /// How far a job has come.
@@ -108,12 +151,14 @@ pub enum Outcome<C: Caster> {
 }
 
 /// The pixels of a job.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
     /// Three bytes a pixel, rows from the top.
     pub pixels: Vec<u8>,
-    /// Rays, steps and the like.
+    /// Rays, steps and the like; those of the check left out.
     pub stats: Stats,
+    /// The errors of the pixels that were measured, if any were to be.
+    pub errors: Option<Summary>,
     /// Time on the pool, waiting for tiles left out.
     pub spent: Duration,
 }
@@ -125,13 +170,20 @@ impl<C: Caster> Job<C> {
         lease: LeaseId,
         view: View,
         region: Region,
+        check: Check,
         stop: Arc<AtomicBool>,
     ) -> Self {
         let pieces = tiles(region.width, region.height, PIECE_PX).into_iter().map(|piece| {
             let region = Region { x: region.x + piece.x, y: region.y + piece.y, ..piece };
-            Piece { region, progress: caster.begin(region), done: false }
+            Piece {
+                region,
+                progress: caster.begin(region),
+                rendered: false,
+                unmeasured: check.pixels(region),
+                errors: Summary::default(),
+            }
         });
-        Job { lease, view, region, pieces: pieces.collect(), stop, spent: Duration::ZERO }
+        Job { lease, view, region, check, pieces: pieces.collect(), stop, spent: Duration::ZERO }
     }
 
     /// Renders what can be rendered, on the thread pool it is called on. Gives the reason
@@ -157,15 +209,20 @@ impl<C: Caster> Job<C> {
 
     /// One go over all pieces that are not done; the tiles they wait for.
     fn sweep(&mut self, caster: &C, scene: &Scene<C::Prepared>) -> BTreeSet<TileKey> {
-        let (view, stop) = (&self.view, &self.stop);
-        let open = self.pieces.par_iter_mut().with_max_len(1).filter(|piece| !piece.done);
+        let (view, stop, frame) = (&self.view, &self.stop, self.check.frame);
+        let open = self.pieces.par_iter_mut().with_max_len(1).filter(|piece| !piece.is_done());
         let advanced = open.map(|piece| {
             if stop.load(Ordering::Relaxed) {
                 return BTreeSet::new();
             }
-            let missing = caster.advance(scene, view, &mut piece.progress);
-            piece.done = missing.is_empty();
-            missing.into_iter().collect()
+            if !piece.rendered {
+                let missing = caster.advance(scene, view, &mut piece.progress);
+                piece.rendered = missing.is_empty();
+                if !piece.rendered {
+                    return missing.into_iter().collect();
+                }
+            }
+            piece.measure(caster, scene, view, frame)
         });
         advanced.reduce(BTreeSet::new, |mut all, more: BTreeSet<_>| {
             all.extend(more);
@@ -177,20 +234,65 @@ impl<C: Caster> Job<C> {
         let began = Instant::now();
         let mut picture = Rgb8::new(self.region.width, self.region.height);
         let mut stats = Stats::default();
+        let mut errors = Summary::default();
         for piece in self.pieces {
             let Region { x, y, .. } = self.region;
             let place = Region { x: piece.region.x - x, y: piece.region.y - y, ..piece.region };
+            let done = piece.is_done();
             let rendered = caster.finish(piece.progress);
-            if !piece.done || !picture.paste(place, &rendered.pixels) {
+            if !done || !picture.paste(place, &rendered.pixels) {
                 return Err(format!("the ray caster left {:?} undone", piece.region));
             }
             stats.rays += rendered.stats.rays;
             stats.steps += rendered.stats.steps;
             stats.hits += rendered.stats.hits;
             stats.below_ground |= rendered.stats.below_ground;
+            errors.merge(&piece.errors);
         }
         let spent = self.spent + began.elapsed();
-        Ok(Picture { pixels: picture.into_pixels(), stats, spent })
+        let errors = (self.check.share != Share::NONE).then_some(errors);
+        Ok(Picture { pixels: picture.into_pixels(), stats, errors, spent })
+    }
+}
+
+impl Check {
+    /// The pixels of a region that are measured.
+    fn pixels(self, region: Region) -> Vec<[u32; 2]> {
+        if self.share == Share::NONE {
+            return Vec::new();
+        }
+        let rows = region.y..region.y + region.height;
+        let all = rows.flat_map(|y| (region.x..region.x + region.width).map(move |x| [x, y]));
+        all.filter(|&[x, y]| self.share.takes(pixel_number(self.frame, x, y))).collect()
+    }
+}
+
+impl<C: Caster> Piece<C> {
+    fn is_done(&self) -> bool {
+        self.rendered && self.unmeasured.is_empty()
+    }
+
+    /// Measures what can be measured; the tiles that the rest waits for.
+    fn measure(
+        &mut self,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+        view: &View,
+        frame: FrameIndex,
+    ) -> BTreeSet<TileKey> {
+        let mut missing = BTreeSet::new();
+        let errors = &mut self.errors;
+        self.unmeasured.retain(|&[x, y]| match caster.gauge(scene, view, x, y) {
+            Ok(error) => {
+                errors.add(pixel_number(frame, x, y), &error);
+                false
+            }
+            Err(tiles) => {
+                missing.extend(tiles);
+                true
+            }
+        });
+        missing
     }
 }
 

@@ -5,7 +5,7 @@
 //! the thread pool, writing in a task of its own), so that a heartbeat is answered at
 //! once whatever else goes on.
 
-use crate::render::{Caster, Job, Outcome, Picture, said};
+use crate::render::{Caster, Check, Job, Outcome, Picture, said};
 use crate::session::{Action, Event, Session};
 use crate::terrain::Terrain;
 use bytes::Bytes;
@@ -251,7 +251,10 @@ impl<'a, C: Caster> Shift<'a, C> {
         let view =
             View { camera: grant.camera, shading: shot.shading.clone(), quality: shot.quality };
         let (lease, region) = (grant.lease, grant.region);
-        self.launch(lease, move |caster| Box::new(Job::new(caster, lease, view, region, stop)))
+        let check = Check { share: shot.check, frame: grant.frame };
+        self.launch(lease, move |caster| {
+            Box::new(Job::new(caster, lease, view, region, check, stop))
+        })
     }
 
     fn resume(&mut self, lease: LeaseId) -> Option<Event> {
@@ -385,5 +388,5 @@ fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<Done, Stri
         steps: picture.stats.steps,
         below_ground: picture.stats.below_ground,
     };
-    Ok(Done { lease, report, pixels })
+    Ok(Done { lease, report, check: picture.errors, pixels })
 }

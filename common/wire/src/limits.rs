@@ -1,6 +1,8 @@
 //! Every limit of the protocol, in one place. The encoder refuses what the decoder
 //! would refuse, so a limit is never discovered by the other side.
 
+#[cfg(doc)]
+use terrafarm_common::accuracy::KEPT_MAX;
 use terrafarm_common::camera::MAX_SIDE_PX;
 
 /// The oldest protocol version this program speaks.
@@ -14,8 +16,11 @@ pub const HELLO_HEAD_MAX: usize = 4 << 10;
 pub const CONTROL_HEAD_MAX: usize = 64 << 10;
 /// Longest head of a submission message, bytes: [`CAMERAS_MAX`] cameras are 118 KiB.
 pub const SUBMISSION_HEAD_MAX: usize = 160 << 10;
-/// Longest head of a message that carries bytes behind it.
-pub const BULK_HEAD_MAX: usize = 1 << 10;
+/// Longest head of a message that carries a blob behind it.
+pub const BLOB_HEAD_MAX: usize = 1 << 10;
+/// Longest head of a message that carries pixels behind it: a summary of their errors
+/// keeps at most [`KEPT_MAX`] values of 14 bytes, 56 KiB.
+pub const PIXELS_HEAD_MAX: usize = 64 << 10;
 /// Longest payload of one frame, bytes. Longer payloads travel in parts of this size, so
 /// that a heartbeat waits for one part at most: 9 ms on gigabit Ethernet.
 pub const PART_BYTES: usize = 1 << 20;
@@ -66,7 +71,8 @@ impl Class {
             Class::Hello => HELLO_HEAD_MAX,
             Class::Control => CONTROL_HEAD_MAX,
             Class::Submission => SUBMISSION_HEAD_MAX,
-            Class::Blob | Class::Pixels => BULK_HEAD_MAX,
+            Class::Blob => BLOB_HEAD_MAX,
+            Class::Pixels => PIXELS_HEAD_MAX,
         }
     }
 

@@ -8,6 +8,7 @@
 use crate::message::Unfit;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use terrafarm_common::accuracy::{Kept, Share, Summary};
 use terrafarm_common::camera::{Camera, MAX_SIDE_PX};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::{Region, Split};
@@ -121,6 +122,59 @@ impl TryFrom<QualityTwin> for Quality {
         let quality = Quality { method, samples_per_side, tolerance_px };
         fit_quality(quality)?;
         Ok(quality)
+    }
+}
+
+/// Twin of [`Share`]: millionths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ShareTwin(u32);
+
+impl From<Share> for ShareTwin {
+    fn from(share: Share) -> Self {
+        ShareTwin(share.millionths())
+    }
+}
+
+impl TryFrom<ShareTwin> for Share {
+    type Error = Unfit;
+
+    fn try_from(twin: ShareTwin) -> Result<Self, Unfit> {
+        Share::from_millionths(twin.0).ok_or_else(|| Unfit("a share is larger than all".into()))
+    }
+}
+
+/// Twin of [`Summary`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SummaryTwin {
+    samples: u64,
+    mismatches: u64,
+    error_max_px: f64,
+    depth_max_m: Option<f64>,
+    kept: Vec<(u32, f32, Option<f32>)>,
+}
+
+impl From<&Summary> for SummaryTwin {
+    fn from(summary: &Summary) -> Self {
+        let kept = summary.kept().iter().map(|kept| (kept.number, kept.error_px, kept.depth_m));
+        SummaryTwin {
+            samples: summary.samples(),
+            mismatches: summary.mismatches(),
+            error_max_px: summary.error_max_px(),
+            depth_max_m: summary.depth_max_m(),
+            kept: kept.collect(),
+        }
+    }
+}
+
+impl TryFrom<SummaryTwin> for Summary {
+    type Error = Unfit;
+
+    fn try_from(twin: SummaryTwin) -> Result<Self, Unfit> {
+        let kept = twin.kept.into_iter();
+        let kept = kept.map(|(number, error_px, depth_m)| Kept { number, error_px, depth_m });
+        let counts = [twin.samples, twin.mismatches];
+        Summary::from_parts(counts, twin.error_max_px, twin.depth_max_m, kept.collect())
+            .ok_or_else(|| Unfit("a summary of errors contradicts itself".into()))
     }
 }
 
@@ -296,6 +350,7 @@ pub(crate) fn fit_shading(shading: &Shading) -> Result<(), Unfit> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use terrafarm_common::accuracy::PixelError;
 
     fn shading() -> Shading {
         Shading {
@@ -356,6 +411,21 @@ mod tests {
         for tolerance_px in [0.0, -1.0, 65.0, f64::NAN, f64::INFINITY] {
             assert!(Quality::try_from(QualityTwin { tolerance_px, ..twin }).is_err());
         }
+    }
+
+    #[test]
+    fn shares_and_summaries_come_back_and_others_are_refused() {
+        let share = Share::from_millionths(1_000_000).expect("it is all");
+        assert_eq!(Share::try_from(ShareTwin::from(share)), Ok(share));
+        assert!(Share::try_from(ShareTwin(1_000_001)).is_err());
+        let mut summary = Summary::default();
+        let (surface_px, occlusion_px) = (0.5, 2.0);
+        summary.add(5, &PixelError { surface_px, occlusion_px, depth_m: None, mismatch: true });
+        let twin = SummaryTwin::from(&summary);
+        assert_eq!(Summary::try_from(twin.clone()), Ok(summary));
+        assert!(Summary::try_from(SummaryTwin { samples: 9, ..twin.clone() }).is_err());
+        assert!(Summary::try_from(SummaryTwin { mismatches: 2, ..twin.clone() }).is_err());
+        assert!(Summary::try_from(SummaryTwin { error_max_px: f64::NAN, ..twin }).is_err());
     }
 
     #[test]

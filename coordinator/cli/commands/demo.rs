@@ -41,6 +41,7 @@ pub fn run(args: &args::Demo) -> anyhow::Result<Outcome> {
         output: folder.join("demo.mp4"),
         poster: Some((POSTER, folder.join("poster.png"))),
         quality: args.casting.over(scene.quality),
+        check: args.casting.check,
         farm: Farm::Local(Crew::fill(Some(args.workers), None)),
         ..Plan::read(&scene, &choice)?
     };

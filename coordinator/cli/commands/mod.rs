@@ -1,6 +1,7 @@
 //! One module a command.
 
 mod bench;
+mod compare;
 mod demo;
 mod render;
 mod serve;
@@ -26,6 +27,7 @@ pub fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Render(args) => render::run(&args),
         Command::Coordinator(args) => serve::coordinator(&args),
         Command::Worker(args) => serve::worker(args),
+        Command::Compare(args) => compare::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Bench(args) => bench::run(&args),
     }

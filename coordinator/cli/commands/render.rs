@@ -6,6 +6,7 @@ use crate::shot::{self, Choice, FRAMES_IN_FLIGHT, Farm, Plan, Report};
 use crate::{Outcome, args};
 use anyhow::Context;
 use std::path::Path;
+use terrafarm_common::accuracy::{Spread, Summary};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_coordinator::sink::Encoder;
 
@@ -33,6 +34,7 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     Ok(Plan {
         name: args.output.display().to_string(),
         quality,
+        check: args.casting.check,
         split: args.split,
         frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
         output: args.output.clone(),
@@ -62,6 +64,40 @@ impl args::Casting {
     }
 }
 
+fn check_json(errors: &Summary) -> serde_json::Value {
+    let spread = |spread: Spread| serde_json::json!({"p50": spread.p50, "p99": spread.p99, "max": spread.max});
+    serde_json::json!({
+        "checked_pixels": errors.samples(),
+        "error_px": errors.error_px().map(spread),
+        "depth_error_m": errors.depth_m().map(spread),
+        "mismatch": errors.mismatch(),
+    })
+}
+
+fn print_check(errors: &Summary) {
+    let Some(error) = errors.error_px() else {
+        println!("checked: no pixel; a larger share would choose some");
+        return;
+    };
+    println!(
+        "checked {} pixels against exact: error p50 {:.3}, p99 {:.3}, max {:.3} pixels",
+        errors.samples(),
+        error.p50,
+        error.p99,
+        error.max
+    );
+    let other = 100.0 * errors.mismatch();
+    match errors.depth_m() {
+        Some(depth) => println!(
+            "  depth p50 {:.3}, p99 {:.3}, max {:.3} m; {other:.2} % see another cell or sky",
+            depth.p50, depth.p99, depth.max
+        ),
+        None => println!(
+            "  no depth to compare; {other:.2} % see ground in place of sky or sky in place of ground"
+        ),
+    }
+}
+
 /// A scene file, or a bare store with the light that a scene has by default.
 fn read_scene(path: &Path) -> anyhow::Result<Scene> {
     if path.extension().is_some_and(|extension| extension == "terrain") {
@@ -86,6 +122,7 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
             "seconds": report.seconds,
             "frames_per_s": report.frames_per_s(),
             "workers": report.manifest.workers.len(),
+            "check": report.errors.as_ref().map(check_json),
         });
         println!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
         return Ok(());
@@ -98,6 +135,9 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
         report.frames_per_s(),
         report.manifest.workers.len(),
     );
+    if let Some(errors) = &report.errors {
+        print_check(errors);
+    }
     println!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());
     if report.manifest.frames.iter().any(|frame| frame.below_ground) {
         println!("warning: the camera was below the ground in some frames; see below_ground there");

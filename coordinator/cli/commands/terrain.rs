@@ -149,6 +149,10 @@ fn print_info(info: &StoreInfo) {
         None => println!("heights       none: every post is void"),
     }
     println!("voids         {} of {} posts", info.void_posts, info.height_posts);
+    println!(
+        "memory        {:.2} bytes per post of heights, all levels and maxima",
+        info.bytes_per_post
+    );
     for (number, layer) in info.layers.iter().enumerate() {
         let tiles: u64 = layer.levels.iter().map(|level| level.filled_tiles).sum();
         println!(

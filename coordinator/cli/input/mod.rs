@@ -5,6 +5,7 @@
 
 pub mod csv;
 pub mod flight;
+pub mod picture;
 pub mod scene;
 
 use std::fmt;

@@ -3,6 +3,7 @@
 use super::*;
 use bytes::Bytes;
 use glam::DVec3;
+use terrafarm_common::accuracy::{PixelError, Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::BlobHash;
 use terrafarm_common::quality::Quality;
@@ -53,6 +54,7 @@ impl Bench {
             index: BlobHash([1; 32]),
             shading: shading(),
             quality: Quality::default(),
+            check: Share::NONE,
             width: SIZE.0,
             height: SIZE.1,
             split: Split::Columns,
@@ -92,7 +94,16 @@ fn grants(out: &[Out]) -> Vec<(WorkerId, Grant)> {
 fn done(grant: &Grant) -> Done {
     let pixels = vec![grant.lease.0 as u8; grant.region.area() as usize * 3];
     let report = RenderReport { cost_us: 500, rays: 1, steps: 1, below_ground: false };
-    Done { lease: grant.lease, report, pixels: Pixels::raw(Bytes::from(pixels)).unwrap() }
+    let mut errors = Summary::default();
+    let error = PixelError {
+        surface_px: f64::from(grant.region.x),
+        occlusion_px: 0.0,
+        depth_m: None,
+        mismatch: true,
+    };
+    errors.add(grant.region.x, &error);
+    let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
+    Done { lease: grant.lease, report, check: Some(errors), pixels }
 }
 
 /// Answers every grant until none is left; returns the frames that came out.
@@ -106,6 +117,8 @@ fn render_all(bench: &mut Bench, mut out: Vec<Out>) -> Vec<(u32, Rgb8)> {
         for one in out {
             if let Out::SendFrame(_, head, picture) = one {
                 let frame = head.with(Pixels::raw(Bytes::new()).unwrap());
+                let errors = frame.check.unwrap();
+                assert_eq!(errors.samples(), u64::from(frame.jobs), "one error a job");
                 next.extend(bench.say(
                     Peer::Client(CLIENT),
                     terrafarm_wire::message::FrameTaken { shot: frame.shot, frame: frame.frame },
@@ -260,6 +273,7 @@ fn a_shot_that_needs_too_much_memory_is_rejected_with_advice() {
         index: BlobHash([1; 32]),
         shading: shading(),
         quality: Quality::default(),
+        check: Share::NONE,
         width: 16_384,
         height: 16_384,
         split: Split::Columns,

@@ -74,9 +74,19 @@ pub struct FrameEntry {
     /// With `--check`: 99th percentile of the error, pixels.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub error_px_p99: Option<f64>,
+    /// With `--check`: the largest error, pixels; 64 stands for 64 and more.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub error_px_max: Option<f64>,
+    /// With `--check`: 99th percentile of the error in depth, metres; absent if nothing
+    /// but sky was measured.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub depth_error_m_p99: Option<f64>,
     /// With `--check`: share of pixels that see another part of the ground.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub mismatch: Option<f64>,
+    /// With `--check`: number of pixels that were measured.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub checked_pixels: Option<u64>,
 }
 
 impl Manifest {

@@ -359,8 +359,11 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
         render_ms: 20.0,
         jobs: 3,
         below_ground: false,
-        error_px_p99: None,
-        mismatch: None,
+        error_px_p99: Some(0.25),
+        error_px_max: Some(0.5),
+        depth_error_m_p99: None,
+        mismatch: Some(0.0),
+        checked_pixels: Some(4),
     };
     let manifest = Manifest {
         program: "terrafarm 0.1.0".into(),
@@ -386,7 +389,10 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
     for key in ["scene", "method", "size", "frames", "program"] {
         assert!(json.get(key).is_some(), "{key}");
     }
-    for key in ["index", "sha256", "ms"] {
+    assert!(json["frames"][0].get("depth_error_m_p99").is_none(), "what is not known is not there");
+    for key in
+        ["index", "sha256", "ms", "error_px_p99", "error_px_max", "mismatch", "checked_pixels"]
+    {
         assert!(json["frames"][0].get(key).is_some(), "{key}");
     }
     assert_eq!(names(folder.path()), ["manifest.json"]);

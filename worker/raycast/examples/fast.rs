@@ -90,12 +90,13 @@ fn main() {
             errors.sort_by(f64::total_cmp);
             let at = |share: f64| errors[((errors.len() - 1) as f64 * share) as usize];
             println!(
-                "{name:6} {:9} {:7.2} Mpix/s {:6.2} ns/px {:5.2} steps {:5.2} rays error p50 {:.4} p99 {:.4} max {:.2}  sky {sky} nan {nan}",
+                "{name:6} {:9} {:7.2} Mpix/s {:6.2} ns/px {:5.2} steps {:5.2} rays {:5.3} fallen error p50 {:.4} p99 {:.4} max {:.2}  sky {sky} nan {nan}",
                 method.name(),
                 1920.0 * 1080.0 / time / 1e6,
                 time * 1e9 / (1920.0 * 1080.0),
                 answer.stats.steps as f64 / (1920.0 * 1080.0),
                 answer.stats.rays as f64 / (1920.0 * 1080.0),
+                answer.stats.hits as f64 / (1920.0 * 1080.0),
                 at(0.5),
                 at(0.99),
                 at(1.0),

@@ -14,20 +14,18 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod one;
-mod two;
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx2::Eight;
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx512::Sixteen;
 pub(crate) use one::One;
-pub(crate) use two::Two;
 
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 use std::sync::OnceLock;
 
 /// The most lanes of any width.
-pub(crate) const MOST: usize = 32;
+pub(crate) const MOST: usize = 16;
 
 /// A width: the types of its vectors.
 pub(crate) trait Lanes: Copy + 'static {
@@ -58,6 +56,7 @@ pub(crate) trait Floats:
     fn abs(self) -> Self;
     fn lt(self, other: Self) -> Self::M;
     fn le(self, other: Self) -> Self::M;
+    fn eq(self, other: Self) -> Self::M;
     fn select(mask: Self::M, yes: Self, no: Self) -> Self;
     /// Towards zero; beyond the range of i32 and for NaN, `i32::MIN`.
     fn truncate(self) -> Self::I;
@@ -65,6 +64,9 @@ pub(crate) trait Floats:
     fn floor(self) -> Self::I;
     /// The same bits.
     fn from_bits(bits: Self::I) -> Self;
+    /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
+    /// if the table has fewer.
+    fn lookup(table: &[f32], at: Self::I) -> Self;
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
@@ -104,6 +106,7 @@ pub(crate) trait Mask:
     Copy + BitAnd<Output = Self> + BitOr<Output = Self> + Not<Output = Self>
 {
     fn none() -> Self;
+    fn select(mask: Self, yes: Self, no: Self) -> Self;
     /// Bit n is lane n.
     fn bits(self) -> u32;
     fn from_bits(bits: u32) -> Self;

@@ -381,9 +381,9 @@ pub fn depths(
     let field = Field { resident, pyramid };
     if view.quality.method == Method::Column {
         if let Some(relief) = Relief::new(field, view) {
-            let columns = Columns { relief: &relief, camera: &view.camera, region };
+            let columns = Columns { relief: &relief, camera: &view.camera, tolerance_px: view.quality.tolerance_px, region };
             let seen = lanes::run(columns, std::env::var("WIDTH").map_or(lanes::widest(), |w| if w == "8" { lanes::Width::Eight } else if w == "1" { lanes::Width::One } else { lanes::widest() }));
-            let stats = Stats { rays: seen.rays, steps: seen.steps, ..Stats::default() };
+            let stats = Stats { hits: seen.fallen, rays: seen.rays, steps: seen.steps, ..Stats::default() };
             let wanted = relief.wanted();
             if !wanted.is_empty() {
                 return Err(Missing(wanted));

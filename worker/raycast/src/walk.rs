@@ -27,6 +27,9 @@ const CLEARANCE_SHARE: f32 = 2e-6;
 const ALONG_GRID: f32 = 1e-12;
 /// The plot of lanes that have left the layer.
 const NOWHERE: i32 = -1;
+/// Cells that a ray passes one by one before it looks at blocks of them. Measured at the
+/// views of `bench core`.
+const PATIENCE: i32 = 3;
 
 /// The lines of N rays.
 pub(crate) struct Lines<L: Lanes> {
@@ -34,8 +37,14 @@ pub(crate) struct Lines<L: Lanes> {
     rate: [L::F; 2],
     /// Metres per cell.
     inverse: [L::F; 2],
-    /// 1 along an axis on which the index of the cell grows, else 0.
+    /// 1 along an axis on which the index of the cell grows, else 0 ...
     ahead: [L::I; 2],
+    /// ... the same as a yes or no ...
+    forward: [L::M; 2],
+    /// ... and as 1 or -1.
+    sign: [L::F; 2],
+    /// What to add to the place of a post to come to the next along an axis.
+    next: [L::I; 2],
     /// Distance at which the line comes over the layer ...
     enter: L::F,
     /// ... and leaves it.
@@ -83,6 +92,21 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     pub steps: u64,
 }
 
+/// Lanes that go from cell to cell.
+#[derive(Clone, Copy)]
+struct Steps<L: Lanes> {
+    /// The lines by which the cell is left, in cells of level 0 from that of the camera.
+    line: [L::F; 2],
+    /// The distances at which these are crossed.
+    crossing: [L::F; 2],
+    /// Cells between this one and the border of the plot, ahead.
+    rest: [L::I; 2],
+    /// Place of the cell's south-west post in the tile.
+    post: L::I,
+    /// Cells passed since the last hit.
+    passed: L::I,
+}
+
 /// The ground of a cell along a line, over the camera.
 #[derive(Clone, Copy)]
 struct Profile<L: Lanes> {
@@ -105,6 +129,9 @@ impl<L: Lanes> Lines<L> {
             rate: direction,
             inverse: direction,
             ahead: [L::I::splat(0); 2],
+            forward: [L::M::none(); 2],
+            sign: direction,
+            next: [L::I::splat(0); 2],
             enter: L::F::splat(0.0),
             leave: L::F::splat(f32::INFINITY),
         };
@@ -116,6 +143,10 @@ impl<L: Lanes> Lines<L> {
             lines.inverse[axis] = L::F::splat(1.0).div(rate);
             let ahead = L::F::splat(0.0).lt(rate);
             lines.ahead[axis] = L::I::select(ahead, L::I::splat(1), L::I::splat(0));
+            lines.forward[axis] = ahead;
+            lines.sign[axis] = L::F::select(ahead, L::F::splat(1.0), L::F::splat(-1.0));
+            let stride = [1, TILE_POSTS as i32][axis];
+            lines.next[axis] = L::I::select(ahead, L::I::splat(stride), L::I::splat(-stride));
             let first = lines.crossing(relief, axis, L::I::splat(0));
             let last = lines.crossing(relief, axis, L::I::splat(relief.cells[axis]));
             lines.enter = lines.enter.max(first.min(last));
@@ -255,8 +286,9 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         }
     }
 
-    /// Casts all rays. Where they meet the surface goes to `met`, as distances on the map:
-    /// NaN where a missing tile leaves it open, and nothing for those that meet nothing.
+    /// Casts all rays. One over the distance on the map at which they meet the surface
+    /// goes to `met`: NaN where a missing tile leaves it open, and nothing for rays that
+    /// meet nothing.
     #[inline(always)]
     pub(crate) fn run(&mut self, met: &mut [f32]) {
         let nowhere = L::I::splat(NOWHERE);
@@ -356,8 +388,9 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
 
     /// Takes lanes over a plot, until each has left it or has cast its last ray.
     ///
-    /// A lane either has a cell before it whose contact with its ray is to be found, or is
-    /// on its way to the next such cell. What most lanes wait for is done first.
+    /// A lane has a cell before it whose contact with its ray is to be found, or goes on to
+    /// the next cell, or looks for it among blocks of cells. What most lanes wait for is
+    /// done first.
     #[inline(always)]
     fn cross_tile(
         &mut self,
@@ -369,150 +402,247 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     ) {
         let relief = self.relief;
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
-        let base = L::I::splat(level as i32);
-        // The blocks of maxima that are as large as the plot.
-        let top = L::I::splat((MAXIMA_LEVELS as u32 - level) as i32);
+        let plain = L::F::splat(0.0);
         let plot = [
             L::I::splat(number % relief.plots[0]),
             L::I::splat(number / relief.plots[0]),
         ];
-        let side = one.shl(top) - one;
+        let bits = MAXIMA_LEVELS as u32 - level;
+        // Cells of the plot: the first, and how many lie behind it.
+        let top = L::I::splat(bits as i32);
         let first = [plot[0].shl(top), plot[1].shl(top)];
+        let side = one.shl(top) - one;
+        let base = L::I::splat(level as i32);
         let mut cell = [
             self.lines.cell_after(relief, 0, self.free, base, first[0], first[0] + side),
             self.lines.cell_after(relief, 1, self.free, base, first[1], first[1] + side),
         ];
-        let none = L::F::splat(0.0);
-        let mut profile =
-            Profile::<L> { start: none, end: none, low: none, high: none, curl: none };
         let mut block = top;
+        let mut steps = Steps::<L> {
+            line: [plain; 2],
+            crossing: [plain; 2],
+            rest: [zero; 2],
+            post: zero,
+            passed: zero,
+        };
+        let mut profile =
+            Profile::<L> { start: plain, end: plain, low: plain, high: plain, curl: plain };
         let mut left = here;
         let mut ready = L::M::none();
-        let mut pass = L::M::none();
+        let mut seeking = here;
         while left.any() {
-            let going = left & !ready;
-            if ready.count() >= going.count() {
+            let walking = left & !ready & !seeking;
+            let (a, b, c) = (ready.count(), walking.count(), seeking.count());
+            if a >= b && a >= c {
+                // Contacts.
                 let (hit, s) = profile.contact(&self.slopes);
                 let hit = hit & ready;
                 if hit.any() {
-                    self.emit(s, hit, met);
+                    let inside = hit & s.lt(self.lines.leave);
+                    self.emit(L::F::splat(1.0).div(s), inside, met);
                     self.slopes = self.rows.slopes(relief, self.row);
-                    let done = hit & !self.row.lt(L::I::splat(self.rows.count));
+                    let done = hit & !(inside & self.row.lt(L::I::splat(self.rows.count)));
                     self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
                     left = left & !done;
                     ready = ready & !done;
+                    steps.passed = L::I::select(hit, zero, steps.passed);
                 }
-                let missed = ready & !hit;
-                pass = pass | missed;
-                ready = ready & !missed;
-                continue;
-            }
-            // To the cell or block behind the one that the lane has done with.
-            let mut within = [cell[0].shr(block), cell[1].shr(block)];
-            let (mut out, mut along_x) = self.exit(within, base + block);
-            if pass.any() {
-                let behind_x = (within[0] + self.lines.ahead[0]).shl(block) - one + self.lines.ahead[0];
-                let behind_y = (within[1] + self.lines.ahead[1]).shl(block) - one + self.lines.ahead[1];
-                let mut beside = cell;
-                if (pass & !block.eq(zero)).any() {
-                    let side = one.shl(block) - one;
-                    let low = within[0].shl(block);
-                    beside[0] = self.lines.cell_after(relief, 0, out, base, low, low + side);
-                    let low = within[1].shl(block);
-                    beside[1] = self.lines.cell_after(relief, 1, out, base, low, low + side);
-                }
-                let next = [
-                    L::I::select(along_x, behind_x, beside[0]),
-                    L::I::select(along_x, beside[1], behind_y),
-                ];
-                let before = L::I::select(along_x, cell[0], cell[1]);
-                let after = L::I::select(along_x, next[0], next[1]);
-                let outside = !before.shr(top).eq(after.shr(top)) | !out.lt(self.lines.leave);
-                let leaving = pass & outside;
+                ready = ready & hit;
+            } else if b >= c {
+                // To the next cells.
+                let along_x = steps.crossing[0].le(steps.crossing[1]);
+                let s = steps.crossing[0].min(steps.crossing[1]);
+                let by_x = walking & along_x;
+                let by_y = walking & !along_x;
+                let rest_x = steps.rest[0] - one;
+                let rest_y = steps.rest[1] - one;
+                let leaving = (by_x & rest_x.lt(zero))
+                    | (by_y & rest_y.lt(zero))
+                    | (walking & !s.lt(self.lines.leave));
+                steps.rest[0] = L::I::select(by_x, rest_x, steps.rest[0]);
+                steps.rest[1] = L::I::select(by_y, rest_y, steps.rest[1]);
                 if leaving.any() {
-                    self.enter_next(plot, out, along_x, leaving);
+                    self.enter_next(plot, s, along_x, leaving);
                     left = left & !leaving;
                 }
-                let moving = pass & !leaving;
-                cell[0] = L::I::select(moving, next[0], cell[0]);
-                cell[1] = L::I::select(moving, next[1], cell[1]);
-                self.free = L::F::select(moving, out, self.free);
-                let parent = block + one;
-                let crossed = !before.shr(parent).eq(after.shr(parent)) & block.lt(top);
-                block = L::I::select(moving & crossed, parent, block);
-                pass = L::M::none();
-                within = [cell[0].shr(block), cell[1].shr(block)];
-                (out, along_x) = self.exit(within, base + block);
-            }
-            let going = left & !ready;
-            let cells = going & block.eq(zero);
-            let blocks = going & !cells;
-            let out = out.min(self.lines.leave);
-            let _ = along_x;
-            if blocks.any() {
+                let stride = L::F::splat((1u32 << level) as f32);
+                let (line_x, line_y) = (
+                    steps.line[0] + self.lines.sign[0] * stride,
+                    steps.line[1] + self.lines.sign[1] * stride,
+                );
+                steps.line[0] = L::F::select(by_x, line_x, steps.line[0]);
+                steps.line[1] = L::F::select(by_y, line_y, steps.line[1]);
+                let across = L::I::select(along_x, self.lines.next[0], self.lines.next[1]);
+                steps.post = L::I::select(walking, steps.post + across, steps.post);
+                steps.passed = L::I::select(walking, steps.passed + one, steps.passed);
+                let going = walking & !leaving;
+                let tired = going & L::I::splat(PATIENCE).lt(steps.passed) & one.lt(top + one);
+                if tired.any() {
+                    self.free = L::F::select(tired, s, self.free);
+                    for axis in 0..2 {
+                        let ahead = self.lines.ahead[axis];
+                        let low = first[axis] + steps.rest[axis];
+                        let high = first[axis] + side - steps.rest[axis];
+                        let at = L::I::select(ahead.eq(one), high, low);
+                        cell[axis] = L::I::select(tired, at, cell[axis]);
+                    }
+                    block = L::I::select(tired, one.min(top), block);
+                    seeking = seeking | tired;
+                }
+                let going = going & !tired;
+                let low = profile.high;
+                let solid = self.look(tile, &mut steps, level, s, going, &mut profile);
+                profile.low = L::F::select(going, low, profile.low);
+                ready = ready | (going & solid);
+            } else {
+                // Among blocks.
+                let within = [cell[0].shr(block), cell[1].shr(block)];
+                let found = seeking & block.eq(zero);
+                let blocks = seeking & !found;
                 self.steps += u64::from(blocks.count());
+                let (out, along_x) = self.exit(within, base + block);
                 let highest = tile.maximum::<L>(maximum::<L>(within, block), blocks);
                 let lowest = self.slopes.height(self.free).min(self.slopes.height(out))
                     - L::F::splat(0.25) * self.slopes.bend(out - self.free, out);
                 let room = L::F::splat(CLEARANCE_M) + lowest.abs() * L::F::splat(CLEARANCE_SHARE);
                 let clear = blocks & (highest + room).lt(lowest);
-                pass = pass | clear;
-                block = L::I::select(blocks & !clear, block - one, block);
-            }
-            if cells.any() {
-                self.steps += u64::from(cells.count());
-                let solid = self.look(tile, cell, base, out, cells, &mut profile);
-                ready = ready | (cells & solid);
-                pass = pass | (cells & !solid);
+                let below = blocks & !clear;
+                // The cell behind the line by which the block is left; beside it, the cell
+                // that the line has come to within the block.
+                let side = one.shl(block) - one;
+                let (low_x, low_y) = (within[0].shl(block), within[1].shl(block));
+                let [ahead_x, ahead_y] = self.lines.ahead;
+                let behind_x = (within[0] + ahead_x).shl(block) - one + ahead_x;
+                let behind_y = (within[1] + ahead_y).shl(block) - one + ahead_y;
+                let beside_x =
+                    self.lines.cell_after(relief, 0, out, base, low_x, low_x + side);
+                let beside_y =
+                    self.lines.cell_after(relief, 1, out, base, low_y, low_y + side);
+                let next_x = L::I::select(along_x, behind_x, beside_x);
+                let next_y = L::I::select(along_x, beside_y, behind_y);
+                let before = L::I::select(along_x, cell[0], cell[1]);
+                let after = L::I::select(along_x, next_x, next_y);
+                let outside = !before.shr(top).eq(after.shr(top)) | !out.lt(self.lines.leave);
+                let leaving = clear & outside;
+                if leaving.any() {
+                    self.enter_next(plot, out, along_x, leaving);
+                    left = left & !leaving;
+                    seeking = seeking & !leaving;
+                }
+                let moving = clear & !leaving;
+                cell[0] = L::I::select(moving, next_x, cell[0]);
+                cell[1] = L::I::select(moving, next_y, cell[1]);
+                self.free = L::F::select(moving, out, self.free);
+                let parent = block + one;
+                let crossed = !before.shr(parent).eq(after.shr(parent)) & block.lt(top);
+                block = L::I::select(moving & crossed, parent, block);
+                block = L::I::select(below, block - one, block);
+                if found.any() {
+                    self.arrive(tile, cell, level, first, found, &mut steps, &mut profile);
+                    let solid = self.look(tile, &mut steps, level, self.free, found, &mut profile);
+                    ready = ready | (found & solid);
+                    seeking = seeking & !found;
+                }
             }
         }
     }
 
-    /// Reads the ground of cells, for the lanes in `lanes`. Returns which have any.
+    /// Readies lanes to walk from the cells that they have found.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
+    fn arrive(
+        &self,
+        tile: &impl Tile,
+        cell: [L::I; 2],
+        level: u32,
+        first: [L::I; 2],
+        lanes: L::M,
+        steps: &mut Steps<L>,
+        profile: &mut Profile<L>,
+    ) {
+        let one = L::I::splat(1);
+        let base = L::I::splat(level as i32);
+        let side = L::I::splat((TILE_CELLS as i32 >> level) - 1);
+        let mut from = [L::F::splat(0.0); 2];
+        for axis in 0..2 {
+            let ahead = self.lines.ahead[axis];
+            let eye = L::I::splat(self.relief.eye_cell[axis]);
+            let line = ((cell[axis] + ahead).shl(base) - eye).to_floats();
+            steps.line[axis] = L::F::select(lanes, line, steps.line[axis]);
+            let done = cell[axis] - first[axis];
+            let rest = L::I::select(ahead.eq(one), side - done, done);
+            steps.rest[axis] = L::I::select(lanes, rest, steps.rest[axis]);
+            let corner = (cell[axis].shl(base) - eye).to_floats();
+            let share = (self.lines.place(self.relief, axis, self.free) - corner)
+                * L::F::splat(1.0 / (1u32 << level) as f32);
+            from[axis] = share.max(L::F::splat(0.0)).min(L::F::splat(1.0));
+            // On the line by which the cell was entered the share is known.
+            let entry = (cell[axis] + one - ahead).shl(base);
+            let on = self.lines.crossing(self.relief, axis, entry).eq(self.free);
+            from[axis] = L::F::select(on, (one - ahead).to_floats(), from[axis]);
+        }
+        steps.post = L::I::select(lanes, post::<L>(cell), steps.post);
+        steps.passed = L::I::select(lanes, L::I::splat(0), steps.passed);
+        let (_, [sw, se, nw, ne]) = tile.corners::<L>(steps.post, lanes);
+        // Exact on the edges: between two posts, as seen from either side.
+        let low = sw + (se - sw) * from[0];
+        let high = nw + (ne - nw) * from[0];
+        let inner = low + (high - low) * from[1];
+        let west = sw + (nw - sw) * from[1];
+        let east = se + (ne - se) * from[1];
+        let zero = L::F::splat(0.0);
+        let full = L::F::splat(1.0);
+        let value = L::F::select(from[1].eq(zero), low, inner);
+        let value = L::F::select(from[1].eq(full), high, value);
+        let value = L::F::select(from[0].eq(zero), west, value);
+        let value = L::F::select(from[0].eq(full), east, value);
+        profile.low = L::F::select(lanes, tile.height::<L>(value), profile.low);
+    }
+
+    /// Reads the ground of the cells that lanes have come to at `start`, but for its height
+    /// there. Returns which have any.
     #[inline(always)]
     fn look(
         &mut self,
         tile: &impl Tile,
-        cell: [L::I; 2],
-        level: L::I,
-        end: L::F,
+        steps: &mut Steps<L>,
+        level: u32,
+        start: L::F,
         lanes: L::M,
         profile: &mut Profile<L>,
     ) -> L::M {
-        let relief = self.relief;
-        let (solid, [sw, se, nw, ne]) = tile.corners::<L>(post::<L>(cell), lanes);
-        let start = self.free;
-        let shrink = L::F::splat(1.0).div(L::I::splat(1).shl(level).to_floats());
-        let x0 = self.share(relief, 0, cell[0], level, shrink, start);
-        let x1 = self.share(relief, 0, cell[0], level, shrink, end);
-        let y0 = self.share(relief, 1, cell[1], level, shrink, start);
-        let y1 = self.share(relief, 1, cell[1], level, shrink, end);
-        let (south, north) = (se - sw, ne - nw);
-        let (a0, b0) = (sw + south * x0, nw + north * x0);
-        let (a1, b1) = (sw + south * x1, nw + north * x1);
-        let curl = (north - south) * (x1 - x0) * (y1 - y0);
+        self.steps += u64::from(lanes.count());
+        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
+        let [eye_x, eye_y] = self.relief.eye_place.map(L::F::splat);
+        let x = (steps.line[0] - eye_x) * self.lines.inverse[0];
+        let y = (steps.line[1] - eye_y) * self.lines.inverse[1];
+        steps.crossing[0] = L::F::select(lanes, x, steps.crossing[0]);
+        steps.crossing[1] = L::F::select(lanes, y, steps.crossing[1]);
+        let along_x = x.le(y);
+        let end = x.min(y);
+        let (solid, [sw, se, nw, ne]) = tile.corners::<L>(steps.post, lanes);
+        // Where on the far edge: the share of the axis that is not crossed.
+        let rate = L::F::select(along_x, self.lines.rate[1], self.lines.rate[0]);
+        let eye = L::F::select(along_x, eye_y, eye_x);
+        let line = L::F::select(along_x, steps.line[1], steps.line[0]);
+        let [ahead_x, ahead_y] = self.lines.forward;
+        let forward = L::M::select(along_x, ahead_y, ahead_x);
+        let shrink = L::F::splat(1.0 / (1u32 << level) as f32);
+        let share = (eye + end * rate - line) * shrink + L::F::select(forward, one, zero);
+        let share = share.max(zero).min(one);
+        let east = [L::F::select(ahead_x, se, sw), L::F::select(ahead_x, ne, nw)];
+        let north = [L::F::select(ahead_y, nw, sw), L::F::select(ahead_y, ne, se)];
+        let near = L::F::select(along_x, east[0], north[0]);
+        let far = L::F::select(along_x, east[1], north[1]);
+        let high = tile.height::<L>(near + (far - near) * share);
+        let length = (end - start) * shrink;
+        let twist = tile.scale::<L>((ne - nw) - (se - sw));
+        let curl = twist * (length * self.lines.rate[0]) * (length * self.lines.rate[1]);
         profile.start = L::F::select(lanes, start, profile.start);
         profile.end = L::F::select(lanes, end, profile.end);
-        profile.low = L::F::select(lanes, a0 + (b0 - a0) * y0, profile.low);
-        profile.high = L::F::select(lanes, a1 + (b1 - a1) * y1, profile.high);
+        profile.high = L::F::select(lanes, high, profile.high);
         profile.curl = L::F::select(lanes, curl, profile.curl);
         solid & lanes
-    }
-
-    /// Where in a cell a line is along an axis, 0 to 1.
-    #[inline(always)]
-    fn share(
-        &self,
-        relief: &Relief,
-        axis: usize,
-        cell: L::I,
-        level: L::I,
-        shrink: L::F,
-        s: L::F,
-    ) -> L::F {
-        let corner = (cell.shl(level) - L::I::splat(relief.eye_cell[axis])).to_floats();
-        let share = (self.lines.place(relief, axis, s) - corner) * shrink;
-        share.max(L::F::splat(0.0)).min(L::F::splat(1.0))
     }
 }
 
@@ -520,9 +650,13 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
 trait Tile {
     /// Highest ground of blocks, 0 being the first block of their level; level from 1.
     fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F;
-    /// Posts at and east of, and north of both, a place in the tile; and whether all four
-    /// are there.
+    /// Posts at and east of, and north of both, a place in the tile, in units of the
+    /// tile; and whether all four are there.
     fn corners<L: Lanes>(&self, at: L::I, lanes: L::M) -> (L::M, [L::F; 4]);
+    /// Height of a value between posts, metres over the camera.
+    fn height<L: Lanes>(&self, value: L::F) -> L::F;
+    /// A difference of values in metres.
+    fn scale<L: Lanes>(&self, difference: L::F) -> L::F;
 }
 
 /// A tile of codes.
@@ -550,17 +684,13 @@ impl<'a> Coded<'a> {
             step: codes.step as f32,
         }
     }
-
-    #[inline(always)]
-    fn height<L: Lanes>(&self, code: L::I) -> L::F {
-        L::F::splat(self.base) + code.to_floats() * L::F::splat(self.step)
-    }
 }
 
 impl Tile for Coded<'_> {
     #[inline(always)]
     fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F {
-        self.height::<L>(L::I::gather_pairs(self.maxima, at, lanes) & L::I::splat(0xFFFF))
+        let code = L::I::gather_pairs(self.maxima, at, lanes) & L::I::splat(0xFFFF);
+        self.height::<L>(code.to_floats())
     }
 
     #[inline(always)]
@@ -572,13 +702,18 @@ impl Tile for Coded<'_> {
         let (sw, se) = (south & low, south.shr(sixteen) & low);
         let (nw, ne) = (north & low, north.shr(sixteen) & low);
         let highest = sw.max(se).max(nw.max(ne));
-        let heights = [
-            self.height::<L>(sw),
-            self.height::<L>(se),
-            self.height::<L>(nw),
-            self.height::<L>(ne),
-        ];
-        (highest.lt(L::I::splat(i32::from(VOID))), heights)
+        let values = [sw.to_floats(), se.to_floats(), nw.to_floats(), ne.to_floats()];
+        (highest.lt(L::I::splat(i32::from(VOID))), values)
+    }
+
+    #[inline(always)]
+    fn height<L: Lanes>(&self, value: L::F) -> L::F {
+        L::F::splat(self.base) + value * L::F::splat(self.step)
+    }
+
+    #[inline(always)]
+    fn scale<L: Lanes>(&self, difference: L::F) -> L::F {
+        difference * L::F::splat(self.step)
     }
 }
 
@@ -593,7 +728,7 @@ impl<'a> Plain<'a> {
     }
 
     #[inline(always)]
-    fn height<L: Lanes>(&self, table: &[u32], at: L::I, lanes: L::M) -> L::F {
+    fn read<L: Lanes>(&self, table: &[u32], at: L::I, lanes: L::M) -> L::F {
         let height = L::F::from_bits(L::I::gather(table, at, lanes));
         height - L::F::splat(self.eye[0]) - L::F::splat(self.eye[1])
     }
@@ -602,20 +737,30 @@ impl<'a> Plain<'a> {
 impl Tile for Plain<'_> {
     #[inline(always)]
     fn maximum<L: Lanes>(&self, at: L::I, lanes: L::M) -> L::F {
-        self.height::<L>(self.maxima, at, lanes)
+        self.read::<L>(self.maxima, at, lanes)
     }
 
     #[inline(always)]
     fn corners<L: Lanes>(&self, at: L::I, lanes: L::M) -> (L::M, [L::F; 4]) {
         let one = L::I::splat(1);
         let north = at + L::I::splat(TILE_POSTS as i32);
-        let sw = self.height::<L>(self.posts, at, lanes);
-        let se = self.height::<L>(self.posts, at + one, lanes);
-        let nw = self.height::<L>(self.posts, north, lanes);
-        let ne = self.height::<L>(self.posts, north + one, lanes);
+        let sw = self.read::<L>(self.posts, at, lanes);
+        let se = self.read::<L>(self.posts, at + one, lanes);
+        let nw = self.read::<L>(self.posts, north, lanes);
+        let ne = self.read::<L>(self.posts, north + one, lanes);
         // A void is NaN, and so is the sum.
         let sum = sw + se + nw + ne;
         (sum.le(sum), [sw, se, nw, ne])
+    }
+
+    #[inline(always)]
+    fn height<L: Lanes>(&self, value: L::F) -> L::F {
+        value
+    }
+
+    #[inline(always)]
+    fn scale<L: Lanes>(&self, difference: L::F) -> L::F {
+        difference
     }
 }
 

@@ -5,6 +5,7 @@
 use super::*;
 use glam::DVec3;
 use proptest::prelude::*;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
@@ -27,9 +28,11 @@ fn open(shot: u64) -> Event {
         below_ground: [0.0; 3],
         bare_ground: None,
     };
-    let quality = Quality::default();
+    let (quality, check) = (Quality::default(), Share::NONE);
     let shot = ShotId(shot);
-    Event::Received(OpenShot { shot, index: INDEX, shading, quality, width: 8, height: 4 }.into())
+    Event::Received(
+        OpenShot { shot, index: INDEX, shading, quality, check, width: 8, height: 4 }.into(),
+    )
 }
 
 fn grant(lease: u64, shot: u64) -> Event {
@@ -49,7 +52,7 @@ fn blob(hash: BlobHash) -> Blob {
 
 fn done(lease: u64) -> Done {
     let pixels = Pixels::raw(vec![0; 96].into()).unwrap();
-    Done { lease: LeaseId(lease), report: RenderReport::default(), pixels }
+    Done { lease: LeaseId(lease), report: RenderReport::default(), check: None, pixels }
 }
 
 /// What the session wants after these events, in short.

@@ -1,10 +1,14 @@
 //! What `terrafarm terrain info` says of a store. Field names are read by scripts.
 
-use crate::layout::{HeightDatum, ImportReport, Layer, LayerKind, TileEntry};
+use crate::layout::{HeightDatum, ImportReport, Layer, LayerKind, StoreIndex, TileEntry, TileKey};
 use crate::store::StoreReader;
 use crate::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
+use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashSet;
+
+/// Tiles of a level that are read, evenly spread, to learn what they take in memory.
+const MEASURED_TILES: usize = 64;
 
 /// A store in figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -29,6 +33,11 @@ pub struct StoreInfo {
     pub height_posts: u64,
     /// How many of them are void.
     pub void_posts: u64,
+    /// Bytes in memory for each of them with all tiles of all levels of the height layers
+    /// loaded, rings and maxima included. Measured on the tiles themselves: on all of a
+    /// level of up to 64, else on 64 of them; one that cannot be read counts as the
+    /// largest.
+    pub bytes_per_post: f64,
     /// The layers, in the order of the index.
     pub layers: Vec<LayerInfo>,
     /// How the store was made.
@@ -50,8 +59,8 @@ pub struct LayerInfo {
     pub height_range_m: Option<[f32; 2]>,
     /// Bytes in the file for each post of level 0, all levels included.
     pub disk_bytes_per_post: f64,
-    /// Bytes in memory for each post of level 0 with all tiles of all levels loaded,
-    /// rings and maxima included.
+    /// Bytes in memory for each post of level 0, measured as
+    /// [`StoreInfo::bytes_per_post`] is.
     pub memory_bytes_per_post: f64,
     /// The levels, finest first.
     pub levels: Vec<LevelInfo>,
@@ -75,42 +84,54 @@ pub struct LevelInfo {
     pub incomparable_tiles: u64,
 }
 
-/// Sums up an open store from its index alone.
-pub fn summary(store: &StoreReader) -> StoreInfo {
-    let index = store.index();
-    let layers: Vec<LayerInfo> = index.layers.iter().map(layer_info).collect();
+/// South-west and north-east corner of all height layers, metres.
+pub fn bounds(index: &StoreIndex) -> [[f64; 2]; 2] {
     let heights = || index.layers_of(LayerKind::Height).map(|(_, layer)| layer);
     let corner = |start: f64, pick: fn(f64, f64) -> f64, of: fn(&Layer) -> [f64; 2]| {
         [0, 1].map(|axis| heights().map(|layer| of(layer)[axis]).fold(start, pick))
     };
+    let min = corner(f64::INFINITY, f64::min, |layer| layer.origin);
+    [min, corner(f64::NEG_INFINITY, f64::max, Layer::far_corner)]
+}
+
+/// Sums up an open store: from its index, and from some tiles of each level.
+pub fn summary(store: &StoreReader) -> StoreInfo {
+    let index = store.index();
+    let layers: Vec<LayerInfo> =
+        (0..index.layers.len()).map(|number| layer_info(store, number)).collect();
+    let heights = || layers.iter().filter(|layer| layer.kind == LayerKind::Height);
+    let posts_of = |layer: &LayerInfo| layer.posts[0] * layer.posts[1];
+    let height_posts: u64 = heights().map(posts_of).sum();
+    let memory_bytes: f64 =
+        heights().map(|layer| layer.memory_bytes_per_post * posts_of(layer) as f64).sum();
+    let [min, max] = bounds(index);
     StoreInfo {
         hash: store.index_blob().0.to_hex(),
         file_bytes: store.file_bytes(),
         crs: index.crs.clone(),
         height_datum: index.height_datum,
         earth_radius_m: index.earth_radius_m,
-        min: corner(f64::INFINITY, f64::min, |layer| layer.origin),
-        max: corner(f64::NEG_INFINITY, f64::max, Layer::far_corner),
+        min,
+        max,
         height_range_m: layers
             .iter()
             .filter_map(|layer| layer.height_range_m)
             .reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]),
-        height_posts: heights().map(|layer| layer.posts[0] * layer.posts[1]).sum(),
+        height_posts,
         void_posts: index.report.void_posts,
+        bytes_per_post: memory_bytes / height_posts as f64,
         layers,
         report: index.report.clone(),
     }
 }
 
-fn layer_info(layer: &Layer) -> LayerInfo {
+fn layer_info(store: &StoreReader, number: usize) -> LayerInfo {
+    let layer = &store.index().layers[number];
     let levels: Vec<LevelInfo> =
         (0..layer.levels.len()).map(|level| level_info(layer, level)).collect();
     let posts = (layer.posts[0] * layer.posts[1]) as f64;
-    let tile_bytes = match layer.kind {
-        LayerKind::Height => HEIGHT_TILE_BYTES,
-        LayerKind::Photo => PHOTO_TILE_BYTES,
-    };
-    let tiles: u64 = levels.iter().map(|level| level.filled_tiles).sum();
+    let memory_bytes: f64 =
+        (0..layer.levels.len()).map(|level| memory_bytes(store, number, level)).sum();
     let bytes: u64 = levels.iter().map(|level| level.bytes).sum();
     LayerInfo {
         kind: layer.kind,
@@ -124,9 +145,35 @@ fn layer_info(layer: &Layer) -> LayerInfo {
             LayerKind::Photo => None,
         },
         disk_bytes_per_post: bytes as f64 / posts,
-        memory_bytes_per_post: tiles as f64 * tile_bytes as f64 / posts,
+        memory_bytes_per_post: memory_bytes / posts,
         levels,
     }
+}
+
+/// What the tiles of a level take in memory, from some of them; see
+/// [`StoreInfo::bytes_per_post`].
+fn memory_bytes(store: &StoreReader, layer: usize, level: usize) -> f64 {
+    let Layer { kind, ref levels, .. } = store.index().layers[layer];
+    let entries = levels[level].entries.iter().enumerate();
+    let filled: Vec<usize> =
+        entries.filter(|(_, entry)| !entry.is_empty()).map(|(at, _)| at).collect();
+    if kind == LayerKind::Photo {
+        return (filled.len() * PHOTO_TILE_BYTES) as f64;
+    }
+    let measured = filled.len().min(MEASURED_TILES);
+    if measured == 0 {
+        return 0.0;
+    }
+    let columns = levels[level].tiles[0] as usize;
+    let tile_bytes = |n: usize| {
+        let at = filled[n * filled.len() / measured];
+        let (tx, ty) = ((at % columns) as u32, (at / columns) as u32);
+        let key = TileKey { layer: layer as u16, level: level as u16, tx, ty };
+        let tile = store.read_tile(key).ok().flatten();
+        tile.map_or(HEIGHT_TILE_BYTES, |tile| tile.memory_bytes())
+    };
+    let bytes: usize = (0..measured).into_par_iter().map(tile_bytes).sum();
+    bytes as f64 * (filled.len() as f64 / measured as f64)
 }
 
 fn level_info(layer: &Layer, number: usize) -> LevelInfo {
@@ -183,9 +230,42 @@ mod tests {
         assert_eq!(base.levels[1].posts, [301, 151]);
         assert_eq!(base.levels[1].incomparable_tiles, 1, "where a void meets the ground");
         assert!(base.levels[1].deviation_m > 0.0);
-        let tiles: u64 = base.levels.iter().map(|level| level.filled_tiles).sum();
-        let expected = (tiles as usize * HEIGHT_TILE_BYTES) as f64 / 180_000.0;
-        assert_eq!(base.memory_bytes_per_post, expected);
+        let memory = |number: u16| {
+            let levels = store.index().layers[usize::from(number)].levels.iter().enumerate();
+            let keys = levels.flat_map(|(level, grid)| {
+                let place = move |at: u32| (at % grid.tiles[0], at / grid.tiles[0]);
+                (0..grid.entries.len() as u32).map(place).map(move |(tx, ty)| TileKey {
+                    layer: number,
+                    level: level as u16,
+                    tx,
+                    ty,
+                })
+            });
+            let tiles = keys.filter_map(|key| store.read_tile(key).unwrap());
+            tiles.map(|tile| tile.memory_bytes()).sum::<usize>() as f64
+        };
+        let near = |a: f64, b: f64| (a / b - 1.0).abs() < 1e-12;
+        assert!(near(base.memory_bytes_per_post, memory(0) / 180_000.0));
+        assert!(near(info.bytes_per_post, (memory(0) + memory(1)) / (180_000.0 + 341.0)));
+        assert!(near(info.layers[2].memory_bytes_per_post, memory(2) / 600.0));
         assert_eq!(info.layers[2].height_range_m, None);
+    }
+
+    #[test]
+    fn many_tiles_are_estimated_from_some_and_damaged_ones_count_in_full() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.terrain");
+        let summary = || super::summary(&StoreReader::open(&path).unwrap());
+        Ground::new().heights(height_layer([20 * 256 + 1; 2]), hills).build(&path).unwrap();
+        let whole = summary();
+        assert!((2.7..4.0).contains(&whole.bytes_per_post), "{}", whole.bytes_per_post);
+
+        let entries = StoreReader::open(&path).unwrap().index().layers[0].levels[0].entries.clone();
+        let mut bytes = std::fs::read(&path).unwrap();
+        for entry in entries {
+            bytes[entry.offset as usize + 40] ^= 1;
+        }
+        std::fs::write(&path, bytes).unwrap();
+        assert!(summary().bytes_per_post > 5.0);
     }
 }

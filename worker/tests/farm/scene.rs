@@ -1,6 +1,7 @@
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_common::quality::Quality;
@@ -66,6 +67,7 @@ impl Terrain {
             index: self.index_hash,
             shading: shading(),
             quality: Quality { samples_per_side, ..Quality::default() },
+            check: Share::NONE,
             width: SIZE.0,
             height: SIZE.1,
         }

@@ -1,9 +1,10 @@
 use crate::scene::{SIZE, Terrain, grant, whole};
 use crate::script::{Coordinator, gated, start, start_with};
+use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::id::LeaseId;
 use terrafarm_common::region::{Region, columns};
 use terrafarm_wire::Message;
-use terrafarm_wire::message::{Drain, Ping, Pong, Role};
+use terrafarm_wire::message::{Drain, OpenShot, Ping, Pong, Role};
 use terrafarm_worker::Ended;
 
 #[tokio::test]
@@ -36,6 +37,36 @@ async fn the_pixels_are_those_of_the_ray_caster_however_the_frame_is_cut() {
     assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
     assert!(peer.recv().await.is_none(), "a clean end");
     assert_eq!(running.ended.await.unwrap().unwrap(), Ended::Stopped);
+}
+
+#[tokio::test]
+async fn the_errors_of_parts_are_those_of_the_whole_and_exact_has_none() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let running = start(coordinator.config(None));
+    let mut peer = coordinator.welcome().await;
+    let check = Share::from_millionths(300_000).unwrap();
+    peer.send(OpenShot { check, ..terrain.open(1, 1) }).await;
+    // The parts first: they wait for the tiles.
+    let mut regions = columns(SIZE.0, SIZE.1, &[7, 40, 41]);
+    let mut parts = Summary::default();
+    regions.push(whole());
+    for (number, region) in regions.iter().enumerate() {
+        peer.send(grant(number as u64, 1, *region)).await;
+    }
+    for region in &regions {
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        let errors = done.check.expect("a check was asked for");
+        if *region != whole() {
+            parts.merge(&errors);
+            continue;
+        }
+        assert_eq!(parts, errors);
+        assert!((1650..2050).contains(&errors.samples()), "{} of 6144", errors.samples());
+        assert_eq!((errors.error_max_px(), errors.mismatches()), (0.0, 0));
+        assert!(errors.depth_max_m().is_some_and(|depth| depth < 1e-3));
+    }
+    drop(running.stop);
 }
 
 #[tokio::test]

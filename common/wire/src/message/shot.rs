@@ -9,11 +9,12 @@ use crate::limits::{CAMERAS_MAX, FRAMES_IN_FLIGHT_MAX, FRAMES_MAX, WORKER_SHARES
 use crate::message::work::RenderReport;
 use crate::pixels::Pixels;
 use crate::twin::{
-    CameraTwin, QualityTwin, ShadingTwin, SplitTwin, fit_camera, fit_quality, fit_shading,
-    fit_size, fit_split,
+    CameraTwin, QualityTwin, ShadingTwin, ShareTwin, SplitTwin, SummaryTwin, fit_camera,
+    fit_quality, fit_shading, fit_size, fit_split,
 };
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
+use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use terrafarm_common::quality::Quality;
@@ -31,8 +32,10 @@ pub struct Submit {
     pub index: BlobHash,
     /// Light, air and sky.
     pub shading: Shading,
-    /// Method and samples.
+    /// Method, tolerance and samples.
     pub quality: Quality,
+    /// What share of the pixels is to be measured.
+    pub check: Share,
     /// Width of its frames, pixels.
     pub width: u32,
     /// Height of its frames, pixels.
@@ -53,6 +56,7 @@ pub(crate) struct SubmitTwin {
     index: BlobHash,
     shading: ShadingTwin,
     quality: QualityTwin,
+    check: ShareTwin,
     size: [u32; 2],
     split: SplitTwin,
     frames: u32,
@@ -69,6 +73,7 @@ impl Body for Submit {
             index: self.index,
             shading: (&self.shading).into(),
             quality: self.quality.into(),
+            check: self.check.into(),
             size: [self.width, self.height],
             split: self.split.into(),
             frames: self.frames,
@@ -83,6 +88,7 @@ impl Body for Submit {
             index: wire.index,
             shading: wire.shading.try_into()?,
             quality: wire.quality.try_into()?,
+            check: wire.check.try_into()?,
             width: wire.size[0],
             height: wire.size[1],
             split: wire.split.try_into()?,
@@ -201,7 +207,7 @@ impl Body for Rejected {
 }
 
 /// A finished frame. The pixels travel behind the message.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
     /// The shot.
     pub shot: ShotId,
@@ -213,12 +219,50 @@ pub struct Frame {
     pub report: RenderReport,
     /// From the first job's grant to the last one's pixels, microseconds.
     pub elapsed_us: u64,
+    /// The errors of the pixels that were measured; `None` if none were to be.
+    pub check: Option<Summary>,
     /// The pixels of the whole frame.
     pub pixels: Pixels,
 }
 
+/// Twin of [`Frame`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct FrameTwin {
+    shot: ShotId,
+    frame: FrameIndex,
+    jobs: u32,
+    report: RenderReport,
+    elapsed_us: u64,
+    check: Option<SummaryTwin>,
+    pixels: Pixels,
+}
+
 impl Body for Frame {
-    own_twin!();
+    type Wire = FrameTwin;
+
+    fn to_wire(&self) -> FrameTwin {
+        FrameTwin {
+            shot: self.shot,
+            frame: self.frame,
+            jobs: self.jobs,
+            report: self.report,
+            elapsed_us: self.elapsed_us,
+            check: self.check.as_ref().map(SummaryTwin::from),
+            pixels: self.pixels.clone(),
+        }
+    }
+
+    fn from_wire(wire: FrameTwin) -> Result<Self, Unfit> {
+        Ok(Frame {
+            shot: wire.shot,
+            frame: wire.frame,
+            jobs: wire.jobs,
+            report: wire.report,
+            elapsed_us: wire.elapsed_us,
+            check: wire.check.map(Summary::try_from).transpose()?,
+            pixels: wire.pixels,
+        })
+    }
 
     fn check(&self) -> Result<(), Unfit> {
         self.pixels.check()

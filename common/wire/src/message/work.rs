@@ -4,11 +4,12 @@ use super::{Body, Unfit, fit_reason, own_twin};
 use crate::limits::HAND_BACK_MAX;
 use crate::pixels::Pixels;
 use crate::twin::{
-    CameraTwin, QualityTwin, RegionTwin, ShadingTwin, fit_camera, fit_quality, fit_region,
-    fit_shading, fit_size,
+    CameraTwin, QualityTwin, RegionTwin, ShadingTwin, ShareTwin, SummaryTwin, fit_camera,
+    fit_quality, fit_region, fit_shading, fit_size,
 };
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
+use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex, LeaseId, ShotId};
 use terrafarm_common::quality::Quality;
@@ -24,8 +25,10 @@ pub struct OpenShot {
     pub index: BlobHash,
     /// Light, air and sky.
     pub shading: Shading,
-    /// Method and samples.
+    /// Method, tolerance and samples.
     pub quality: Quality,
+    /// What share of the pixels is to be measured.
+    pub check: Share,
     /// Width of its frames, pixels.
     pub width: u32,
     /// Height of its frames, pixels.
@@ -39,6 +42,7 @@ pub(crate) struct OpenShotTwin {
     index: BlobHash,
     shading: ShadingTwin,
     quality: QualityTwin,
+    check: ShareTwin,
     size: [u32; 2],
 }
 
@@ -51,6 +55,7 @@ impl Body for OpenShot {
             index: self.index,
             shading: (&self.shading).into(),
             quality: self.quality.into(),
+            check: self.check.into(),
             size: [self.width, self.height],
         }
     }
@@ -61,6 +66,7 @@ impl Body for OpenShot {
             index: wire.index,
             shading: wire.shading.try_into()?,
             quality: wire.quality.try_into()?,
+            check: wire.check.try_into()?,
             width: wire.size[0],
             height: wire.size[1],
         })
@@ -174,18 +180,43 @@ pub struct RenderReport {
 }
 
 /// The pixels of a job. They travel behind the message.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Done {
     /// The lease.
     pub lease: LeaseId,
     /// What it took.
     pub report: RenderReport,
+    /// The errors of the pixels that were measured; `None` if none were to be.
+    pub check: Option<Summary>,
     /// The pixels of the region.
     pub pixels: Pixels,
 }
 
+/// Twin of [`Done`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct DoneTwin {
+    lease: LeaseId,
+    report: RenderReport,
+    check: Option<SummaryTwin>,
+    pixels: Pixels,
+}
+
 impl Body for Done {
-    own_twin!();
+    type Wire = DoneTwin;
+
+    fn to_wire(&self) -> DoneTwin {
+        DoneTwin {
+            lease: self.lease,
+            report: self.report,
+            check: self.check.as_ref().map(SummaryTwin::from),
+            pixels: self.pixels.clone(),
+        }
+    }
+
+    fn from_wire(wire: DoneTwin) -> Result<Self, Unfit> {
+        let check = wire.check.map(Summary::try_from).transpose()?;
+        Ok(Done { lease: wire.lease, report: wire.report, check, pixels: wire.pixels })
+    }
 
     fn check(&self) -> Result<(), Unfit> {
         self.pixels.check()

@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use proptest::prelude::*;
+use terrafarm_common::accuracy::{PixelError, Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_common::quality::{Method, Quality};
@@ -39,6 +40,18 @@ fn report() -> RenderReport {
     RenderReport { cost_us: 12_345, rays: 2_073_600, steps: 1 << 33, below_ground: true }
 }
 
+/// Errors of three pixels, two of which see other ground.
+fn errors() -> Summary {
+    let mut errors = Summary::default();
+    for (number, surface_px, depth_m) in
+        [(70_000, 0.25, Some(-1.5)), (3, 64.0, None), (9, 0.0, Some(0.0))]
+    {
+        let mismatch = surface_px > 0.0;
+        errors.add(number, &PixelError { surface_px, occlusion_px: 0.0, depth_m, mismatch });
+    }
+    errors
+}
+
 fn pixels() -> Pixels {
     Pixels::raw((0..24u8).collect::<Vec<_>>().into()).unwrap()
 }
@@ -48,6 +61,7 @@ pub fn all() -> Vec<(String, Message)> {
     let hash = BlobHash(std::array::from_fn(|i| i as u8));
     let quality = Quality { method: Method::Reference, samples_per_side: 8, tolerance_px: 0.25 };
     let (shot, lease, frame, number) = (ShotId(300), LeaseId(70_000), 17, 5);
+    let share = Share::from_millionths(10_000).unwrap();
     let text = || "because: é".to_owned();
     let hello = |role| Hello {
         versions: Versions { oldest: 1, newest: 1 },
@@ -73,8 +87,16 @@ pub fn all() -> Vec<(String, Message)> {
         WantBlobs { hashes: vec![hash, BlobHash([255; 32])] }.into(),
         Blob { hash, bytes: b"a tile"[..].into() }.into(),
         NoBlob { hash, why: text() }.into(),
-        OpenShot { shot, index: hash, shading: shading(), quality, width: 1920, height: 1080 }
-            .into(),
+        OpenShot {
+            shot,
+            index: hash,
+            shading: shading(),
+            quality,
+            check: share,
+            width: 1920,
+            height: 1080,
+        }
+        .into(),
         Grant {
             lease,
             shot,
@@ -86,7 +108,7 @@ pub fn all() -> Vec<(String, Message)> {
         Revoke { lease }.into(),
         CloseShot { shot }.into(),
         Drain {}.into(),
-        Done { lease, report: report(), pixels: pixels() }.into(),
+        Done { lease, report: report(), check: Some(errors()), pixels: pixels() }.into(),
         Failed { lease, reason: text() }.into(),
         HandBack { leases: vec![lease, LeaseId(0)] }.into(),
         Submit {
@@ -95,6 +117,7 @@ pub fn all() -> Vec<(String, Message)> {
             index: hash,
             shading: shading(),
             quality,
+            check: share,
             width: 1920,
             height: 1080,
             split: Split::Tiles(128),
@@ -107,7 +130,16 @@ pub fn all() -> Vec<(String, Message)> {
         Cancel { shot }.into(),
         Accepted { number, shot }.into(),
         Rejected { number, reason: text() }.into(),
-        Frame { shot, frame, jobs: 60, report: report(), elapsed_us: 99, pixels: pixels() }.into(),
+        Frame {
+            shot,
+            frame,
+            jobs: 60,
+            report: report(),
+            elapsed_us: 99,
+            check: Some(errors()),
+            pixels: pixels(),
+        }
+        .into(),
         FrameFailed { shot, frame, reason: text() }.into(),
         Progress { shot, frames_done: 1, frames_failed: 2, jobs_running: 3, workers: 4 }.into(),
         ShotDone {
@@ -190,12 +222,29 @@ fn any_pixels() -> impl Strategy<Value = Pixels> {
     })
 }
 
+/// Up to twice as many as are kept.
+fn any_errors() -> impl Strategy<Value = Summary> {
+    let one = (any::<u32>(), 0.0..=64.0f64, prop::option::of(-1e9..1e9f64), any::<bool>());
+    let few = prop::collection::vec(one, 0..50);
+    (few, prop::sample::select(vec![1u32, 200])).prop_map(|(few, times)| {
+        let mut errors = Summary::default();
+        for round in 0..times {
+            for &(number, surface_px, depth_m, mismatch) in &few {
+                let error = PixelError { surface_px, occlusion_px: 0.0, depth_m, mismatch };
+                errors.add(number.wrapping_mul(2 * round + 1), &error);
+            }
+        }
+        errors
+    })
+}
+
 /// Any message whose fields are more than a few numbers; the others are in [`all`].
 pub fn any_message() -> impl Strategy<Value = Message> {
     let open = (any::<u64>(), any_hash(), any_shading(), any_quality(), 1u32..=16_384).prop_map(
         |(shot, index, shading, quality, width)| {
             let shot = ShotId(shot);
-            OpenShot { shot, index, shading, quality, width, height: 7 }.into()
+            let check = Share::from_millionths(width).unwrap();
+            OpenShot { shot, index, shading, quality, check, width, height: 7 }.into()
         },
     );
     let grant = (any::<[u64; 2]>(), any::<u32>(), any_camera(), any::<[prop::sample::Index; 4]>())
@@ -217,6 +266,7 @@ pub fn any_message() -> impl Strategy<Value = Message> {
                 index: BlobHash([3; 32]),
                 shading,
                 quality,
+                check: Share::NONE,
                 width: side,
                 height: side,
                 split: if side % 2 == 0 { Split::Columns } else { Split::Tiles(side) },
@@ -230,12 +280,11 @@ pub fn any_message() -> impl Strategy<Value = Message> {
         prop::collection::vec(any_hash(), 1..50).prop_map(|hashes| WantBlobs { hashes }.into());
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
-    let done = (any::<[u64; 4]>(), any::<bool>(), any_pixels()).prop_map(
-        |([lease, cost_us, rays, steps], below_ground, pixels)| {
+    let done = (any::<[u64; 4]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
+        .prop_map(|([lease, cost_us, rays, steps], below_ground, pixels, check)| {
             let report = RenderReport { cost_us, rays, steps, below_ground };
-            Done { lease: LeaseId(lease), report, pixels }.into()
-        },
-    );
+            Done { lease: LeaseId(lease), report, check, pixels }.into()
+        });
     let failed = (any::<u64>(), ".{0,300}")
         .prop_map(|(lease, reason)| Failed { lease: LeaseId(lease), reason }.into());
     let hand_back = prop::collection::vec(any::<u64>().prop_map(LeaseId), 0..50)

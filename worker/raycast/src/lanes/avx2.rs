@@ -5,7 +5,7 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask, Two};
+use super::{Floats, Ints, Kernel, Lanes, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -117,6 +117,7 @@ impl Floats for F {
     }
     binary!(lt, M, _mm256_cmp_ps, _CMP_LT_OQ);
     binary!(le, M, _mm256_cmp_ps, _CMP_LE_OQ);
+    binary!(eq, M, _mm256_cmp_ps, _CMP_EQ_OQ);
     #[inline(always)]
     fn select(mask: M, yes: F, no: F) -> F {
         // SAFETY: see the page of this module.
@@ -136,6 +137,18 @@ impl Floats for F {
     fn from_bits(bits: I) -> F {
         // SAFETY: see the page of this module.
         unsafe { F(_mm256_castsi256_ps(bits.0)) }
+    }
+    #[inline(always)]
+    fn lookup(table: &[f32], at: I) -> F {
+        let table = &table[..16];
+        // SAFETY: see the page of this module.
+        unsafe {
+            let low = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table.as_ptr()), at.0);
+            let high = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table[8..].as_ptr()), at.0);
+            // The bit that tells 8 and above from below, where a blend looks for it.
+            let upper = _mm256_castsi256_ps(_mm256_slli_epi32::<28>(at.0));
+            F(_mm256_blendv_ps(low, high, upper))
+        }
     }
     #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
@@ -223,6 +236,11 @@ impl Mask for M {
     fn none() -> M {
         // SAFETY: see the page of this module.
         unsafe { M(_mm256_setzero_ps()) }
+    }
+    #[inline(always)]
+    fn select(mask: M, yes: M, no: M) -> M {
+        // SAFETY: see the page of this module.
+        unsafe { M(_mm256_blendv_ps(no.0, yes.0, mask.0)) }
     }
     #[inline(always)]
     fn bits(self) -> u32 {

@@ -2,7 +2,7 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask, Two};
+use super::{Floats, Ints, Kernel, Lanes, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -126,6 +126,7 @@ impl Floats for F {
     }
     binary!(lt, M, _mm512_cmp_ps_mask, _CMP_LT_OQ);
     binary!(le, M, _mm512_cmp_ps_mask, _CMP_LE_OQ);
+    binary!(eq, M, _mm512_cmp_ps_mask, _CMP_EQ_OQ);
     #[inline(always)]
     fn select(mask: M, yes: F, no: F) -> F {
         // SAFETY: see the page of this module.
@@ -146,6 +147,16 @@ impl Floats for F {
     fn from_bits(bits: I) -> F {
         // SAFETY: see the page of this module.
         unsafe { F(_mm512_castsi512_ps(bits.0)) }
+    }
+    #[inline(always)]
+    fn lookup(table: &[f32], at: I) -> F {
+        let table = &table[..32];
+        // SAFETY: see the page of this module.
+        unsafe {
+            let low = _mm512_loadu_ps(table.as_ptr());
+            let high = _mm512_loadu_ps(table[16..].as_ptr());
+            F(_mm512_permutex2var_ps(low, at.0, high))
+        }
     }
     #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
@@ -219,6 +230,10 @@ impl Mask for M {
     #[inline(always)]
     fn none() -> M {
         M(0)
+    }
+    #[inline(always)]
+    fn select(mask: M, yes: M, no: M) -> M {
+        M((mask.0 & yes.0) | (!mask.0 & no.0))
     }
     #[inline(always)]
     fn bits(self) -> u32 {

@@ -102,6 +102,10 @@ impl Floats for F {
         M(self.0 <= other.0)
     }
     #[inline(always)]
+    fn eq(self, other: F) -> M {
+        M(self.0 == other.0)
+    }
+    #[inline(always)]
     fn select(mask: M, yes: F, no: F) -> F {
         if mask.0 { yes } else { no }
     }
@@ -118,6 +122,10 @@ impl Floats for F {
     #[inline(always)]
     fn from_bits(bits: I) -> F {
         F(f32::from_bits(bits.0 as u32))
+    }
+    #[inline(always)]
+    fn lookup(table: &[f32], at: I) -> F {
+        F(table[..2][at.0 as usize & 1])
     }
     #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
@@ -200,6 +208,10 @@ impl Mask for M {
     #[inline(always)]
     fn none() -> M {
         M(false)
+    }
+    #[inline(always)]
+    fn select(mask: M, yes: M, no: M) -> M {
+        if mask.0 { yes } else { no }
     }
     #[inline(always)]
     fn bits(self) -> u32 {

@@ -27,6 +27,7 @@ mod plan;
 pub mod request;
 mod run;
 mod sample;
+mod step;
 mod surface;
 mod warp;
 

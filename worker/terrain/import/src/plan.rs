@@ -6,12 +6,14 @@ use std::sync::Arc;
 use terrafarm_geo::Crs;
 use terrafarm_raster::info::{Content, Raster, Vertical};
 use terrafarm_terrain::layout::{HeightDatum, MAX_LAYERS};
+use terrafarm_terrain::rounding::in_words;
 
 use crate::grid::{Grid, overlap, union};
 use crate::mosaic::{Mosaic, Placed};
 use crate::place::{bounds_in, native_spacing, place, plan_grid};
 use crate::request::{ImportError, ImportSettings};
 use crate::run::Sources;
+use crate::step::computed_step_m;
 use crate::surface::{MAX_FILL_POSTS, StackedMosaic, Way};
 
 /// Photos belong to one layer if their resolutions differ by no more than this factor.
@@ -127,11 +129,14 @@ impl Plan {
             let [dx, dy] = layer.grid.spacing.map(|step| format!("{step:.6}"));
             let trim = |text: &str| text.trim_end_matches('0').trim_end_matches('.').to_owned();
             let spacing = format!("{} x {} m", trim(&dx), trim(&dy));
+            let step = computed_step_m(&layer.grid, &layer.mosaics).filter(|_| kind != "photo");
+            let rounding =
+                step.map(|step| format!(", rounded to {}", in_words(step))).unwrap_or_default();
             for stacked in &layer.mosaics {
                 let done = if stacked.way.is_untouched() {
                     format!("taken untouched, {spacing}")
                 } else {
-                    format!("resampled to {spacing}")
+                    format!("resampled to {spacing}{rounding}")
                 };
                 let b = stacked.bounds;
                 let partly = kind == "photo"

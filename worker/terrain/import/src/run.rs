@@ -15,6 +15,7 @@ use crate::measure::Measurement;
 use crate::photo::PhotoStack;
 use crate::plan::{Plan, PlannedLayer, centre_of, file_name};
 use crate::request::{ImportError, ImportRequest, ImportSettings, ImportSummary, Progress, Stage};
+use crate::step::quantum_m;
 use crate::surface::{Filled, Heights, Inset, Stack, StackedMosaic, Watched};
 /// Memory for decoded blocks of all inputs together, bytes.
 const CACHE_BYTES: usize = 256 << 20;
@@ -88,7 +89,7 @@ fn build(
         true => None,
         false => Some(gaussian_radius_m(crs.to_lonlat(centre_of(base.grid.bounds()))?[1])),
     };
-    let base = Arc::new(Stack { grid: base.grid, mosaics: base.mosaics });
+    let base = Arc::new(Stack::new(base.grid, base.mosaics));
     let surface: Arc<dyn Heights> = match fill {
         Some(reach) => Arc::new(Filled { below: base.clone(), reach: reach as usize }),
         None => base.clone(),
@@ -97,7 +98,7 @@ fn build(
     let mut builder = StoreBuilder::create(output, crs.text(), datum, radius)?;
     let unfilled = fill.map(|_| &*base as &dyn Heights);
     let watched = Watched::new(&*surface, unfilled);
-    let spec = height_spec(&base.grid, quantum(&base.mosaics));
+    let spec = height_spec(&base);
     builder.add_layer(spec, &watched, &stage(progress, Stage::Heights), cancel)?;
     if !watched.any_valid.load(Ordering::Relaxed) {
         return Err(ImportError::AllVoid { inputs: names(&base.mosaics) });
@@ -107,11 +108,11 @@ fn build(
     let mut layers = vec![surface.clone()];
     let mut stacks = vec![base.clone()];
     for (number, PlannedLayer { grid, mosaics }) in insets.into_iter().enumerate() {
-        let own = Arc::new(Stack { grid, mosaics });
+        let own = Arc::new(Stack::new(grid, mosaics));
         let inset = Inset { own: own.clone(), below: layers.clone() };
         let stage = stage(progress, Stage::Inset(number + 1));
         let source = Watched::new(&inset, None);
-        builder.add_layer(height_spec(&grid, None), &source, &stage, cancel)?;
+        builder.add_layer(height_spec(&own), &source, &stage, cancel)?;
         void_posts += source.void.load(Ordering::Relaxed);
         layers.push(Arc::new(inset));
         stacks.push(own);
@@ -155,20 +156,10 @@ fn build(
     Ok(ImportSummary { store, report, crs: crs.text().to_owned(), filled_posts })
 }
 
-fn height_spec(grid: &Grid, quantum_m: Option<f32>) -> LayerSpec {
-    let Grid { origin, spacing, posts } = *grid;
+fn height_spec(stack: &Stack) -> LayerSpec {
+    let Grid { origin, spacing, posts } = stack.grid;
+    let quantum_m = quantum_m(&stack.mosaics).map(|step| step as f32);
     LayerSpec { kind: LayerKind::Height, origin, spacing, posts, quantum_m }
-}
-
-/// The step that all heights of untouched mosaics share.
-fn quantum(mosaics: &[StackedMosaic]) -> Option<f32> {
-    let untouched = mosaics.iter().all(|stacked| stacked.way.is_untouched());
-    let mut steps = mosaics
-        .iter()
-        .flat_map(|stacked| stacked.mosaic.rasters())
-        .map(|placed| placed.raster.info().quantum_m);
-    let first = steps.next().flatten().filter(|_| untouched)?;
-    steps.all(|step| step == Some(first)).then_some(first as f32)
 }
 
 fn names(mosaics: &[impl std::borrow::Borrow<StackedMosaic>]) -> String {

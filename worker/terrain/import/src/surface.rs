@@ -11,11 +11,13 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use terrafarm_geo::{Crs, Transformer};
 use terrafarm_terrain::build::{LayerSource, SourceError};
 use terrafarm_terrain::layout::TILE_CELLS;
+use terrafarm_terrain::rounding::rounded;
 
 use crate::grid::{Grid, PostWindow};
 use crate::mosaic::{LatticeWindow, Mosaic};
 use crate::request::ImportError;
 use crate::sample::{Sample, bilinear};
+use crate::step::computed_step_m;
 use crate::warp::Warp;
 
 /// Where heights come from.
@@ -133,6 +135,20 @@ pub(crate) struct Stack {
     pub(crate) grid: Grid,
     /// Topmost last.
     pub(crate) mosaics: Vec<StackedMosaic>,
+    /// What computed heights are rounded to, metres.
+    step_m: Option<f64>,
+}
+
+impl Stack {
+    pub(crate) fn new(grid: Grid, mosaics: Vec<StackedMosaic>) -> Stack {
+        let step_m = computed_step_m(&grid, &mosaics);
+        Stack { grid, mosaics, step_m }
+    }
+
+    /// A height that is no sample of a file, as it is kept.
+    fn computed(&self, height: f32) -> f32 {
+        rounded(height.into(), self.step_m)
+    }
 }
 
 /// A mosaic with its way from the posts.
@@ -159,9 +175,10 @@ impl Heights for Stack {
             let read = |window| mosaic.heights(window).map_err(ImportError::from);
             let own: Vec<f32> = stacked.way.samples(window, mosaic, &read)?;
             let mut complete = true;
+            let untouched = stacked.way.is_untouched();
             for (post, own) in found.iter_mut().zip(own) {
                 if post.is_nan() {
-                    *post = own;
+                    *post = if untouched { own } else { self.computed(own) };
                 }
                 complete &= !post.is_nan();
             }
@@ -186,7 +203,7 @@ pub(crate) fn window_bounds(grid: &Grid, window: PostWindow) -> [f64; 4] {
 /// first valid posts found are averaged with weights 1/distance². Nothing is carried on
 /// from filled posts, so the result does not depend on the order of the work.
 pub(crate) struct Filled {
-    pub(crate) below: Arc<dyn Heights>,
+    pub(crate) below: Arc<Stack>,
     pub(crate) reach: usize,
 }
 
@@ -255,7 +272,7 @@ impl Filled {
                 }
             }
         }
-        if weights > 0.0 { (sum / weights) as f32 } else { f32::NAN }
+        if weights > 0.0 { self.below.computed((sum / weights) as f32) } else { f32::NAN }
     }
 }
 
@@ -295,7 +312,7 @@ impl Heights for Inset {
             missing.iter().map(|&n| frame.at(place(n).map(|post| post as f64))).collect();
         let found = surface_at(&self.below, &positions)?;
         for (n, found) in missing.into_iter().zip(found) {
-            own[n] = found;
+            own[n] = self.own.computed(found);
         }
         Ok(own)
     }

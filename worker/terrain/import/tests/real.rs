@@ -9,7 +9,8 @@ use std::sync::atomic::AtomicBool;
 
 use terrafarm_geo::Crs;
 use terrafarm_import::{ImportRequest, ImportSettings, ImportSummary, import};
-use terrafarm_terrain::layout::{HeightDatum, Layer, LayerKind};
+use terrafarm_terrain::info::summary;
+use terrafarm_terrain::layout::{HeightDatum, Layer, LayerKind, TILE_CELLS, TILE_POSTS};
 use terrafarm_terrain::sample::Sampler;
 use terrafarm_terrain::store::StoreReader;
 
@@ -96,6 +97,21 @@ impl Store {
     }
 }
 
+impl Store {
+    /// Checks that all tiles take two bytes a post; says what that comes to.
+    #[track_caller]
+    fn takes_two_bytes_a_post(&self) {
+        let layer = self.base();
+        let tile_bytes = 2 * (TILE_POSTS * TILE_POSTS + TILE_CELLS * TILE_CELLS / 3);
+        let tiles = layer.levels.iter().flat_map(|level| &level.entries);
+        let filled = tiles.filter(|entry| !entry.is_empty()).count();
+        let found = summary(&self.reader).layers[0].memory_bytes_per_post;
+        let posts = (layer.posts[0] * layer.posts[1]) as f64;
+        println!("{:?} posts: {found:.2} bytes per post in memory", layer.posts);
+        assert!(found < (filled * (tile_bytes + 200)) as f64 / posts, "{found}");
+    }
+}
+
 fn text(path: &Path) -> String {
     path.display().to_string()
 }
@@ -111,6 +127,7 @@ fn a_geographic_srtm_cutout_agrees_with_gdalwarp() {
         ..ImportRequest::default()
     });
     assert_eq!(store.reader.index().crs, "EPSG:32612");
+    store.takes_two_bytes_a_post();
     let (count, worst) = store.against_warp(&[text(&input)], 1);
     println!("{count} posts, {worst} m; report: {:?}", store.summary.report);
     assert!(count as u64 * 10 > store.base().posts[0] * store.base().posts[1] * 9);
@@ -135,6 +152,8 @@ fn two_srtm_tiles_join_as_in_gdalwarp() {
     let status = Command::new("gdalbuildvrt").arg("-q").arg(&joined).args(inside).status().unwrap();
     assert!(status.success());
     assert_eq!(store.base().spacing, [25.0, 25.0]);
+    store.takes_two_bytes_a_post();
+    assert!(summary(&store.reader).bytes_per_post < 4.0);
     assert_eq!(store.reader.index().height_datum, HeightDatum::Geoid);
     let (count, worst) = store.against_warp(&[text(&joined)], 10);
     println!("{count} posts, {worst} m; report: {:?}", store.summary.report);
@@ -158,6 +177,7 @@ fn a_projected_quadrangle_is_taken_untouched() {
         store_of(ImportRequest { elevation: vec![input.clone()], ..ImportRequest::default() });
     assert_eq!(store.reader.index().crs, "EPSG:26710");
     assert_eq!(store.base().posts[0], 327);
+    store.takes_two_bytes_a_post();
     let (count, worst) = store.against_warp(&[text(&input)], 1);
     assert!(count > 140_000 && worst < 1e-3, "{count} {worst}");
     assert_eq!(store.summary.report.max_resampling_error_m, 0.0);

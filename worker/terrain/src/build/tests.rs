@@ -92,11 +92,39 @@ fn coarser_levels_are_the_tent_of_finer_ones_across_tile_borders() {
 
 #[test]
 fn the_deviation_bounds_the_distance_to_the_finest_level() {
+    let spiky = |i: u64, j: u64| hills(i, j) + if i % 37 == 5 && j % 41 == 7 { 200.0 } else { 0.0 };
+    check_deviation(height_layer([1100, 530]), spiky, 2.0, 0.0);
+}
+
+#[test]
+fn the_deviation_holds_where_rounding_is_most_of_it() {
+    for (spacing, seed) in [(3.0, 1), (10.0, 2), (90.0, 3)] {
+        // Slopes of a few steps between posts, and noise below a step.
+        let noise = move |i: u64, j: u64| {
+            let mixed = (seed ^ i << 20 ^ j).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
+            (mixed % 1000) as f32 * 1e-5
+        };
+        let calm = move |i: u64, j: u64| 700.0 + 0.013 * i as f32 - 0.0071 * j as f32 + noise(i, j);
+        let spec = LayerSpec { spacing: [spacing; 2], quantum_m: None, ..height_layer([700, 300]) };
+        check_deviation(spec, calm, 2.0, 4.0 * COARSEST_STEP_M);
+    }
+}
+
+/// The coarsest step of [`crate::rounding`], metres.
+const COARSEST_STEP_M: f64 = 0.125;
+
+/// Compares the coarser levels' first tile with level 0, and its deviation with what is
+/// found: it must not be less, and neither more than `slack` times as much and `slack_m`.
+fn check_deviation(
+    spec: LayerSpec,
+    rule: impl Fn(u64, u64) -> f32 + Copy + Sync + 'static,
+    slack: f64,
+    slack_m: f64,
+) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.terrain");
-    let spiky = |i: u64, j: u64| hills(i, j) + if i % 37 == 5 && j % 41 == 7 { 200.0 } else { 0.0 };
-    let [width, height] = [1100, 530];
-    Ground::new().heights(height_layer([width, height]), spiky).build(&path).unwrap();
+    let [width, height] = spec.posts;
+    Ground::new().heights(spec, rule).build(&path).unwrap();
     let store = StoreReader::open(&path).unwrap();
     let layer = &store.index().layers[0];
     for level in 1..layer.levels.len() as u16 {
@@ -111,13 +139,16 @@ fn the_deviation_bounds_the_distance_to_the_finest_level() {
                 let (u, v) = (x - ci as f64, y - cj as f64);
                 let [sw, se, nw, ne] = tile.corners(ci as usize, cj as usize).map(f64::from);
                 let coarse = (sw * (1.0 - u) + se * u) * (1.0 - v) + (nw * (1.0 - u) + ne * u) * v;
-                largest = largest.max((coarse - f64::from(spiky(i, j))).abs());
+                largest = largest.max((coarse - f64::from(rule(i, j))).abs());
             }
         }
         let bound = f64::from(entry.deviation);
         assert!(largest <= bound, "level {level}: {largest} > {bound}");
-        let slack = if level == 1 { 1e-6 } else { 2.0 };
-        assert!(bound <= largest * (1.0 + slack), "level {level}: {bound} is far from {largest}");
+        let (slack, slack_m) = if level == 1 { (1e-6, 0.0) } else { (slack, slack_m) };
+        let most = largest * (1.0 + slack) + slack_m;
+        assert!(bound <= most, "level {level}: {bound} is far from {largest}");
+        let step = crate::rounding::step_m(layer.level_spacing(usize::from(level))).unwrap();
+        assert!(tile.to_posts().iter().all(|post| post.is_nan() || f64::from(*post) % step == 0.0));
     }
 }
 

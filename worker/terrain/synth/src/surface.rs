@@ -1,9 +1,9 @@
 //! The ground at a place: the macro map enlarged, with detail that fits what is there.
 
+use crate::SynthSpec;
 use crate::grid::Sample;
 use crate::landscape::Landscape;
 use crate::noise::{Noise, mix, smoothstep};
-use crate::SynthSpec;
 
 /// The longest wavelength of added detail, cells of the macro map.
 const DETAIL_CELLS: f32 = 4.5;

@@ -6,7 +6,11 @@ use proptest::prelude::*;
 use std::sync::OnceLock;
 use std::sync::atomic::AtomicBool;
 use terrafarm_synth::{Synth, SynthError, SynthSpec, synthesize, write_store};
+use terrafarm_terrain::info::summary;
+use terrafarm_terrain::layout::TileKey;
+use terrafarm_terrain::resident::Tile;
 use terrafarm_terrain::store::StoreReader;
+use terrafarm_terrain::tile::Heights;
 
 fn spec(posts: u32, seed: u64) -> SynthSpec {
     SynthSpec { posts, spacing_m: 60.0, seed, photo_scale: 1 }
@@ -185,4 +189,32 @@ fn a_store_holds_what_was_made() {
         assert_eq!(sampled, Some(f64::from(heights[j * 90 + i])));
     }
     assert_eq!(store.index().layers[1].posts, [179, 179]);
+}
+
+#[test]
+fn its_tiles_take_two_bytes_a_post_whatever_the_spacing() {
+    let folder = tempfile::tempdir().unwrap();
+    for (posts, spacing_m, step) in
+        [(513, 0.5, "1/512 m"), (1025, 15.0, "1/32 m"), (513, 200.0, "1/8 m")]
+    {
+        let path = folder.path().join("land.terrain");
+        let spec = SynthSpec { spacing_m, ..spec(posts, 3) };
+        write_store(spec, &path, &|_| (), &AtomicBool::new(false)).unwrap();
+        let store = StoreReader::open(&path).unwrap();
+        let levels = store.index().layers[0].levels.iter().enumerate();
+        for (level, grid) in levels {
+            for ty in 0..grid.tiles[1] {
+                for tx in 0..grid.tiles[0] {
+                    let key = TileKey { layer: 0, level: level as u16, tx, ty };
+                    let Some(Tile::Height(tile)) = store.read_tile(key).unwrap() else { panic!() };
+                    assert!(matches!(tile.heights(), Heights::Codes(_)), "{spacing_m} m: {key:?}");
+                }
+            }
+        }
+        let line = &store.index().report.inputs[0];
+        assert!(line.ends_with(&format!("heights in steps of {step}")), "{line}");
+        let found = summary(&store).bytes_per_post;
+        println!("{posts} posts, {spacing_m} m: {found:.2} bytes per post in memory");
+        assert!(found < 4.0, "{found}");
+    }
 }
