@@ -59,8 +59,8 @@ const FULL: Extent = Extent {
 };
 const SHORT: Extent = Extent {
     size: (320, 180),
-    synth: SynthSpec { posts: 513, spacing_m: 30.0, seed: 3, photo_scale: 1 },
-    patches: ([4, 2], 8),
+    synth: SynthSpec { posts: 257, spacing_m: 60.0, seed: 3, photo_scale: 1 },
+    patches: ([2, 2], 8),
     repeats: 1,
 };
 
