@@ -98,7 +98,8 @@ impl<'a> Beams<'a> {
             let scale = layer.spacing.map(|spacing| 1.0 / spacing);
             let cells = cells_of(layer);
             for (count, spacing) in cells.into_iter().zip(layer.spacing) {
-                first_step = first_step.max(f64::from(count) * spacing * FIRST_STEP);
+                // A step of 0 would never end: a single post counts as a cell.
+                first_step = first_step.max(f64::from(count.max(1)) * spacing * FIRST_STEP);
             }
             let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
             Grid { number, eye, scale, cells }

@@ -135,3 +135,14 @@ fn the_tiles_that_a_picture_needs_count_as_used() {
     }
     assert!(told_apart >= 6, "{told_apart} views");
 }
+
+#[test]
+fn beams_over_a_single_post_end() {
+    let post = Plan::heights([0.0; 2], [10.0; 2], [1, 1], |_, _| 5.0);
+    let land = Land::new("post", vec![post]);
+    let mut view = view(&land, &mut Dice::new(1));
+    view.camera.position = DVec3::new(0.0, -300.0, 700.0);
+    view.shading.earth = None;
+    let rendered = render(&land.resident, &land.pyramid, &view, Region::whole(SIZE.0, SIZE.1));
+    assert_eq!((rendered.stats.hits, rendered.missing.len()), (0, 0));
+}
