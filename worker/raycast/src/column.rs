@@ -15,6 +15,7 @@ use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use crate::lattice::{Band, Fan, Frame};
 use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
+use crate::seen::Seen;
 use crate::walk::{Lines, Rows, Walk, as_bits};
 use glam::DVec2;
 use std::ops::Range;
@@ -41,19 +42,6 @@ pub(crate) struct Columns<'r, 'a> {
     pub region: Region,
 }
 
-/// Depths, pixel by pixel, and what they took.
-pub(crate) struct Seen {
-    /// One over the depth (distance along the axis of the camera), per metre; 0 for the
-    /// sky, NaN where a tile is missing.
-    pub inverse_depth: Vec<f32>,
-    /// Blocks and cells looked at.
-    pub steps: u64,
-    /// Rays cast.
-    pub rays: u64,
-    /// Pixels that were given a ray of their own.
-    pub alone: u64,
-}
-
 /// A row of pixels, and the lines around them.
 struct Span {
     pixels: Range<u32>,
@@ -75,8 +63,7 @@ impl Kernel for Columns<'_, '_> {
     #[inline(always)]
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
-        let mut seen =
-            Seen { inverse_depth: vec![f32::NAN; area], steps: 0, rays: 0, alone: 0 };
+        let mut seen = Seen::new(self.region);
         let mut net = Net { answers: Vec::new(), width: 0, first_ray: 0, first_line: 0 };
         let mut alone = Vec::new();
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
@@ -240,9 +227,9 @@ impl Columns<'_, '_> {
             pitch: net.width as i32 * step,
         };
         let lines = Lines::<L>::new(self.relief, [x, y]);
-        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0));
+        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0), 8);
         walk.run(&mut net.answers);
-        walk.steps
+        walk.looked
     }
 
     /// Sees the pixels of a row between the rays around them. Those that cannot be seen so

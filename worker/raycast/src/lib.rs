@@ -42,6 +42,7 @@ mod progress;
 mod pyramid;
 mod reference;
 mod relief;
+mod seen;
 mod shade;
 mod srgb;
 #[cfg(test)]

@@ -69,9 +69,9 @@ pub(crate) fn cast_pixels<L: Lanes>(
         };
         let direction = [L::F::load(&values[0]), L::F::load(&values[1])];
         let lines = Lines::<L>::new(relief, direction);
-        let mut walk = Walk::new(relief, lines, rows, L::F::load(&values[4]));
+        let mut walk = Walk::new(relief, lines, rows, L::F::load(&values[4]), 2);
         walk.run(inverse_depth);
-        steps += walk.steps;
+        steps += walk.looked;
     }
     steps
 }

@@ -1,6 +1,6 @@
 //! A single lane: the scalar twin of every kernel.
 
-use super::{Floats, Ints, Lanes, Mask};
+use super::{Floats, Ints, Lanes, MOST, Mask};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
 #[derive(Clone, Copy)]
@@ -188,12 +188,13 @@ impl Ints for I {
         if mask.0 { yes } else { no }
     }
     #[inline(always)]
-    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: I, last: I, mask: M) -> I {
         if !mask.0 {
             return I(0);
         }
-        let at = (at.0 as u32 as usize).min(table.len() - 2);
-        I((u32::from(table[at]) | u32::from(table[at + 1]) << 16) as i32)
+        let at = (at.0 as u32).min(last.0 as u32) as usize;
+        // SAFETY: the caller has seen that so much can be read.
+        I(unsafe { bases[0].add(at).cast::<i32>().read_unaligned() })
     }
     #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
