@@ -64,6 +64,7 @@ pub(crate) trait Floats:
     fn floor(self) -> Self::I;
     /// The same bits.
     fn from_bits(bits: Self::I) -> Self;
+    fn to_bits(self) -> Self::I;
     /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
     /// if the table has fewer.
     fn lookup(table: &[f32], at: Self::I) -> Self;
@@ -107,6 +108,12 @@ pub(crate) trait Ints:
     /// For each lane in `mask` an element of a table, lanes outside get 0. An index outside
     /// the table reads from its end.
     fn gather(table: &[u32], at: Self, mask: Self::M) -> Self;
+    /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
+    /// lanes outside get 0. An index outside the table reads from its end.
+    fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
+    /// For each lane in `mask` the elements `at` to `at + 3` of a table of at least four,
+    /// as pairs; as above.
+    fn gather_fours(table: &[u16], at: Self, mask: Self::M) -> (Self, Self);
 }
 
 /// A yes or no a lane.

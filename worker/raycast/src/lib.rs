@@ -52,6 +52,7 @@ mod walk;
 pub use lanes::Width;
 pub use progress::{Depths, Hit, Missing, Progress, Rendered, Stats, cast, depths, trace};
 pub use pyramid::Pyramid;
+pub use shade::shade;
 
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;

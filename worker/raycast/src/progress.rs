@@ -10,7 +10,7 @@ use crate::field::{Contact, Field, Outcome};
 use crate::path::{Ground, Path};
 use crate::pyramid::Pyramid;
 use crate::reference::Reference;
-use crate::shade::Shader;
+use crate::shade::{Places, Shader, map_distance};
 use crate::srgb;
 use glam::DVec3;
 use std::collections::BTreeSet;
@@ -87,7 +87,12 @@ impl Progress {
         let mut painter = Painter::new(field, view);
         let mut beams = Beams::new(field, &view.camera, painter.ground);
         for square in squares(self.region) {
-            beams.narrow(square, &mut |x, y, free| self.paint(&mut painter, x, y, free));
+            beams.narrow(square, &mut |x, y, free| {
+                if !self.done[self.place(x, y)] {
+                    painter.cast(x, y, free);
+                }
+            });
+            painter.shade(&mut |x, y, color| self.paint(x, y, color));
         }
         self.stats.steps += beams.steps;
         painter.finish(&mut self.stats, &mut missing);
@@ -104,17 +109,16 @@ impl Progress {
         Rendered { pixels: self.pixels, missing, stats: self.stats }
     }
 
-    fn paint(&mut self, painter: &mut Painter, x: u32, y: u32, free: f64) {
+    fn place(&self, x: u32, y: u32) -> usize {
         let (column, row) = (x - self.region.x, y - self.region.y);
-        let at = row as usize * self.region.width as usize + column as usize;
-        if self.done[at] {
-            return;
-        }
-        if let Some(color) = painter.pixel(x, y, free) {
-            self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
-            self.done[at] = true;
-            self.left -= 1;
-        }
+        row as usize * self.region.width as usize + column as usize
+    }
+
+    fn paint(&mut self, x: u32, y: u32, color: LinearRgb) {
+        let at = self.place(x, y);
+        self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
+        self.done[at] = true;
+        self.left -= 1;
     }
 
     fn fill(&mut self, color: [u8; 3]) {
@@ -147,8 +151,21 @@ struct Painter<'a> {
     caster: Caster<'a>,
     shader: Shader<'a>,
     samples: u32,
+    cast: Cast,
     rays: u64,
     hits: u64,
+}
+
+/// Pixels whose rays are cast but not shaded.
+#[derive(Default)]
+struct Cast {
+    pixels: Vec<[u32; 2]>,
+    /// Places of their samples, pixels, and the map distances of these; see [`Places`].
+    x: Vec<f32>,
+    y: Vec<f32>,
+    s: Vec<f32>,
+    /// Light of the samples.
+    light: [Vec<f32>; 3],
 }
 
 /// One of the methods.
@@ -193,41 +210,65 @@ impl<'a> Painter<'a> {
             caster: Caster::new(field, view.quality.method),
             shader: Shader::new(field, &view.camera, &view.shading, samples),
             samples,
+            cast: Cast::default(),
             rays: 0,
             hits: 0,
         }
     }
 
-    /// The mean of the samples of a pixel; `None` if a tile is missing. All samples are
-    /// tried in any case, so that all missing tiles become known.
-    fn pixel(&mut self, x: u32, y: u32, free: f64) -> Option<LinearRgb> {
-        let mut sum = [0.0f32; 3];
-        let mut complete = true;
+    /// Casts the rays of a pixel.
+    fn cast(&mut self, x: u32, y: u32, free: f64) {
+        self.cast.pixels.push([x, y]);
         for row in 0..self.samples {
             for column in 0..self.samples {
                 let place = self.place(x, y, column, row);
-                match self.sample(place, free) {
-                    Some(color) => (0..3).for_each(|c| sum[c] += color[c].min(1.0)),
-                    None => complete = false,
-                }
+                let s = self.sample(place, free);
+                self.cast.x.push(place[0] as f32);
+                self.cast.y.push(place[1] as f32);
+                self.cast.s.push(s);
             }
         }
-        let share = 1.0 / (self.samples * self.samples) as f32;
-        complete.then(|| sum.map(|channel| channel * share))
     }
 
-    fn sample(&mut self, place: [f64; 2], free: f64) -> Option<LinearRgb> {
+    /// Map distance to what is seen at a place of the picture; see [`Places`].
+    fn sample(&mut self, place: [f64; 2], free: f64) -> f32 {
         self.rays += 1;
         let (path, free_u) = path(&self.view.camera, self.ground, place, free);
         match self.caster.cast(&path, free_u) {
             Outcome::Hit(contact) => {
                 self.hits += 1;
-                let distance = path.distance(contact.u, contact.z);
-                self.shader.ground(&contact, path.direction, distance)
+                map_distance(path.direction, contact.u)
             }
-            Outcome::Miss => Some(self.shader.sky(path.direction)),
-            Outcome::Unfinished => None,
+            Outcome::Miss => f32::INFINITY,
+            Outcome::Unfinished => f32::NAN,
         }
+    }
+
+    /// Shades the pixels that were cast; `see` is told of those for which no tile is
+    /// missing, with the mean of their samples. All samples are tried in any case, so that
+    /// all missing tiles become known.
+    fn shade(&mut self, see: &mut impl FnMut(u32, u32, LinearRgb)) {
+        let Cast { pixels, x, y, s, light } = &mut self.cast;
+        for channel in light.iter_mut() {
+            channel.resize(s.len(), 0.0);
+        }
+        let [red, green, blue] = light;
+        self.shader.shade(Places { x, y, s }, [red, green, blue]);
+        let count = (self.samples * self.samples) as usize;
+        let share = 1.0 / count as f32;
+        for (at, &[x, y]) in pixels.iter().enumerate() {
+            let samples = at * count..(at + 1) * count;
+            if light[0][samples.clone()].iter().all(|light| !light.is_nan()) {
+                let sum = |c: usize| -> f32 {
+                    light[c][samples.clone()].iter().map(|light| light.min(1.0)).sum()
+                };
+                see(x, y, [0, 1, 2].map(|c| sum(c) * share));
+            }
+        }
+        pixels.clear();
+        x.clear();
+        y.clear();
+        s.clear();
     }
 
     /// Where a sample lies in the picture: the centre of its share of the pixel, and for

@@ -124,6 +124,10 @@ impl Floats for F {
         F(f32::from_bits(bits.0 as u32))
     }
     #[inline(always)]
+    fn to_bits(self) -> I {
+        I(self.0.to_bits() as i32)
+    }
+    #[inline(always)]
     fn lookup(table: &[f32], at: I) -> F {
         F(table[..2][at.0 as usize & 1])
     }
@@ -202,6 +206,20 @@ impl Ints for I {
             return I(0);
         }
         I(table[(at.0 as u32 as usize).min(table.len() - 1)] as i32)
+    }
+    #[inline(always)]
+    fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
+        if !mask.0 {
+            return (I(0), I(0));
+        }
+        let at = (at.0 as u32 as usize).min(table.len() - 2);
+        (I(table[at] as i32), I(table[at + 1] as i32))
+    }
+    #[inline(always)]
+    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
+        let at = I((at.0 as u32 as usize).min(table.len() - 4) as i32);
+        let next = I(at.0 + 2);
+        (Self::gather_pairs(table, at, mask), Self::gather_pairs(table, next, mask))
     }
 }
 
