@@ -5,7 +5,7 @@ use crate::column::Columns;
 use crate::lanes;
 use crate::relief::Relief;
 use crate::beam::{Beams, WIDEST_PX};
-use crate::exact::Exact;
+use crate::exact::{Exact, Many};
 use crate::field::{Contact, Field, Outcome};
 use crate::path::{Ground, Path};
 use crate::pyramid::Pyramid;
@@ -22,7 +22,7 @@ use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::Resident;
 
 /// Share by which a depth is shortened where it becomes a parameter, against rounding.
-const ROUNDING: f64 = 1e-9;
+pub(crate) const ROUNDING: f64 = 1e-9;
 
 /// A region with its pixels.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -87,7 +87,15 @@ impl Progress {
         let mut painter = Painter::new(field, view);
         let mut beams = Beams::new(field, &view.camera, painter.ground);
         for square in squares(self.region) {
-            beams.narrow(square, &mut |x, y, free| self.paint(&mut painter, x, y, free));
+            beams.narrow(square, &mut |x, y, free| {
+                if !self.done[self.at(x, y)] {
+                    if !painter.has_room() {
+                        painter.cast(&mut |x, y, color| self.paint(x, y, color));
+                    }
+                    painter.add(x, y, free);
+                }
+            });
+            painter.cast(&mut |x, y, color| self.paint(x, y, color));
         }
         self.stats.steps += beams.steps;
         painter.finish(&mut self.stats, &mut missing);
@@ -104,17 +112,17 @@ impl Progress {
         Rendered { pixels: self.pixels, missing, stats: self.stats }
     }
 
-    fn paint(&mut self, painter: &mut Painter, x: u32, y: u32, free: f64) {
+    /// Place of a pixel of the frame among those of the region.
+    fn at(&self, x: u32, y: u32) -> usize {
         let (column, row) = (x - self.region.x, y - self.region.y);
-        let at = row as usize * self.region.width as usize + column as usize;
-        if self.done[at] {
-            return;
-        }
-        if let Some(color) = painter.pixel(x, y, free) {
-            self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
-            self.done[at] = true;
-            self.left -= 1;
-        }
+        row as usize * self.region.width as usize + column as usize
+    }
+
+    fn paint(&mut self, x: u32, y: u32, color: LinearRgb) {
+        let at = self.at(x, y);
+        self.pixels[3 * at..3 * at + 3].copy_from_slice(&srgb::encode(color));
+        self.done[at] = true;
+        self.left -= 1;
     }
 
     fn fill(&mut self, color: [u8; 3]) {
@@ -144,7 +152,9 @@ pub(crate) fn squares(region: Region) -> impl Iterator<Item = Region> {
 struct Painter<'a> {
     view: &'a View,
     ground: Ground,
-    caster: Caster<'a>,
+    many: Many<'a>,
+    /// The pixels to which the rays belong, each with all of its samples.
+    pixels: Vec<[u32; 2]>,
     shader: Shader<'a>,
     samples: u32,
     rays: u64,
@@ -152,13 +162,13 @@ struct Painter<'a> {
 }
 
 /// One of the methods.
-enum Caster<'a> {
+pub(crate) enum Caster<'a> {
     Exact(Exact<'a>),
     Reference(Reference<'a>),
 }
 
 impl<'a> Caster<'a> {
-    fn new(field: Field<'a>, method: Method) -> Self {
+    pub(crate) fn new(field: Field<'a>, method: Method) -> Self {
         match method {
             Method::Reference => Caster::Reference(Reference::new(field)),
             _ => Caster::Exact(Exact::new(field)),
@@ -166,7 +176,7 @@ impl<'a> Caster<'a> {
     }
 
     /// Finds where a ray meets the surface. It is known not to before `free_u`.
-    fn cast(&mut self, path: &Path, free_u: f64) -> Outcome {
+    pub(crate) fn cast(&mut self, path: &Path, free_u: f64) -> Outcome {
         match self {
             Caster::Exact(caster) => caster.cast(path, free_u),
             Caster::Reference(caster) => caster.cast(path),
@@ -174,7 +184,7 @@ impl<'a> Caster<'a> {
     }
 
     /// Steps taken; the tiles that were missing go into the set.
-    fn finish(self, missing: &mut BTreeSet<TileKey>) -> u64 {
+    pub(crate) fn finish(self, missing: &mut BTreeSet<TileKey>) -> u64 {
         let (mut wanted, steps) = match self {
             Caster::Exact(caster) => (caster.wanted, caster.steps),
             Caster::Reference(caster) => (caster.wanted, caster.steps),
@@ -187,10 +197,13 @@ impl<'a> Caster<'a> {
 impl<'a> Painter<'a> {
     fn new(field: Field<'a>, view: &'a View) -> Self {
         let samples = view.quality.samples_per_side.clamp(1, Quality::MAX_SAMPLES_PER_SIDE);
+        let ground = Ground::new(view.shading.earth);
+        let method = view.quality.method;
         Painter {
             view,
-            ground: Ground::new(view.shading.earth),
-            caster: Caster::new(field, view.quality.method),
+            ground,
+            many: Many::new(field, &view.camera, ground, method, lanes::widest()),
+            pixels: Vec::new(),
             shader: Shader::new(field, &view.camera, &view.shading, samples),
             samples,
             rays: 0,
@@ -198,34 +211,51 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The mean of the samples of a pixel; `None` if a tile is missing. All samples are
-    /// tried in any case, so that all missing tiles become known.
-    fn pixel(&mut self, x: u32, y: u32, free: f64) -> Option<LinearRgb> {
-        let mut sum = [0.0f32; 3];
-        let mut complete = true;
+    /// Whether all samples of one more pixel find room.
+    fn has_room(&self) -> bool {
+        self.many.room() >= (self.samples * self.samples) as usize
+    }
+
+    fn add(&mut self, x: u32, y: u32, free: f64) {
+        self.pixels.push([x, y]);
         for row in 0..self.samples {
             for column in 0..self.samples {
-                let place = self.place(x, y, column, row);
-                match self.sample(place, free) {
+                self.many.push(self.place(x, y, column, row), free);
+            }
+        }
+    }
+
+    /// Casts all rays. Tells of each pixel the mean of its samples, unless a tile is
+    /// missing. All samples are tried in any case, so that all missing tiles become known.
+    fn cast(&mut self, paint: &mut impl FnMut(u32, u32, LinearRgb)) {
+        self.many.cast();
+        self.rays += self.many.len() as u64;
+        let samples = (self.samples * self.samples) as usize;
+        let share = 1.0 / samples as f32;
+        for (number, [x, y]) in std::mem::take(&mut self.pixels).into_iter().enumerate() {
+            let mut sum = [0.0f32; 3];
+            let mut complete = true;
+            for ray in number * samples..(number + 1) * samples {
+                match self.sample(ray) {
                     Some(color) => (0..3).for_each(|c| sum[c] += color[c].min(1.0)),
                     None => complete = false,
                 }
             }
+            if complete {
+                paint(x, y, sum.map(|channel| channel * share));
+            }
         }
-        let share = 1.0 / (self.samples * self.samples) as f32;
-        complete.then(|| sum.map(|channel| channel * share))
+        self.many.clear();
     }
 
-    fn sample(&mut self, place: [f64; 2], free: f64) -> Option<LinearRgb> {
-        self.rays += 1;
-        let (path, free_u) = path(&self.view.camera, self.ground, place, free);
-        match self.caster.cast(&path, free_u) {
+    fn sample(&mut self, ray: usize) -> Option<LinearRgb> {
+        let direction = self.many.direction(ray);
+        match self.many.outcome(ray) {
             Outcome::Hit(contact) => {
                 self.hits += 1;
-                let distance = path.distance(contact.u, contact.z);
-                self.shader.ground(&contact, path.direction, distance)
+                self.shader.ground(&contact, direction, self.many.distance(ray))
             }
-            Outcome::Miss => Some(self.shader.sky(path.direction)),
+            Outcome::Miss => Some(self.shader.sky(direction)),
             Outcome::Unfinished => None,
         }
     }
@@ -248,7 +278,7 @@ impl<'a> Painter<'a> {
         self.shader.wanted.drain_into(missing);
         stats.rays += self.rays;
         stats.hits += self.hits;
-        stats.steps += self.caster.finish(missing);
+        stats.steps += self.many.steps + self.many.slow.finish(missing);
     }
 }
 
@@ -333,28 +363,44 @@ pub fn trace(
     region: Region,
     mut see: impl FnMut(u32, u32, Option<Hit>),
 ) -> Result<Stats, Missing> {
+    sweep(resident, pyramid, view, region, |many, ray, [x, y]| match many.outcome(ray) {
+        Outcome::Hit(contact) => see(x, y, Some(Hit::new(&many.path(ray).0, &contact))),
+        Outcome::Miss => see(x, y, None),
+        Outcome::Unfinished => {}
+    })
+}
+
+/// Casts the rays through the centres of the pixels of a region and shows each.
+fn sweep(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+    mut see: impl FnMut(&mut Many, usize, [u32; 2]),
+) -> Result<Stats, Missing> {
     let mut stats = Stats::default();
     let mut missing = BTreeSet::new();
     let field = Field { resident, pyramid };
     let ground = Ground::new(view.shading.earth);
-    let mut caster = Caster::new(field, view.quality.method);
+    let method = view.quality.method;
+    let mut many = Many::new(field, &view.camera, ground, method, lanes::widest());
     let mut beams = Beams::new(field, &view.camera, ground);
+    let mut pixels = Vec::new();
     for square in squares(region) {
+        pixels.clear();
+        many.clear();
         beams.narrow(square, &mut |x, y, free| {
-            let place = [f64::from(x) + 0.5, f64::from(y) + 0.5];
-            let (path, free_u) = path(&view.camera, ground, place, free);
-            stats.rays += 1;
-            match caster.cast(&path, free_u) {
-                Outcome::Hit(contact) => {
-                    stats.hits += 1;
-                    see(x, y, Some(Hit::new(&path, &contact)));
-                }
-                Outcome::Miss => see(x, y, None),
-                Outcome::Unfinished => {}
-            }
+            pixels.push([x, y]);
+            many.push([f64::from(x) + 0.5, f64::from(y) + 0.5], free);
         });
+        many.cast();
+        stats.rays += many.len() as u64;
+        for (ray, &pixel) in pixels.iter().enumerate() {
+            stats.hits += u64::from(many.is_hit(ray) == Some(true));
+            see(&mut many, ray, pixel);
+        }
     }
-    stats.steps = beams.steps + caster.finish(&mut missing);
+    stats.steps = beams.steps + many.steps + many.slow.finish(&mut missing);
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
 }
 
@@ -392,10 +438,10 @@ pub fn depths(
         }
     }
     let mut distance_m = vec![f32::INFINITY; region.area() as usize];
-    let stats = trace(resident, pyramid, view, region, |x, y, hit| {
+    let stats = sweep(resident, pyramid, view, region, |many, ray, [x, y]| {
         let at = (y - region.y) as usize * region.width as usize + (x - region.x) as usize;
-        if let Some(hit) = hit {
-            distance_m[at] = hit.distance_m as f32;
+        if many.is_hit(ray) == Some(true) {
+            distance_m[at] = many.distance(ray) as f32;
         }
     })?;
     Ok(Depths { distance_m, stats })

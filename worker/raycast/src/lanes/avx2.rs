@@ -5,6 +5,8 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -25,6 +27,7 @@ impl Lanes for Eight {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety

@@ -2,6 +2,8 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -21,6 +23,7 @@ impl Lanes for Sixteen {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety

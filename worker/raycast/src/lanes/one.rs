@@ -1,5 +1,7 @@
 //! A single lane: the scalar twin of every kernel.
 
+mod doubles;
+
 use super::{Floats, Ints, Lanes, Mask};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -18,6 +20,7 @@ impl Lanes for One {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 macro_rules! operator {
