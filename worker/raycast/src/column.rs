@@ -29,6 +29,9 @@ const SPACING: f64 = 5.0;
 const SPACINGS: [f64; 2] = [0.5, 4.0];
 /// Rays see neighbouring ground if their depths differ by no more than this share.
 const NEIGHBOURS: f32 = 0.02;
+/// How much closer than the nearest ground seen around a pixel its own ray begins to look:
+/// a ridge may come closer between the rays around it.
+const SHARE_FREE: f32 = 0.9;
 /// Lines a pixel up to which those between N pixels are no more than 2 N.
 const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
@@ -98,7 +101,7 @@ impl Kernel for Columns<'_, '_> {
                 let near = frames[0].owns(x, y) && frames[0].is_near(y)
                     || frames[1].owns(y, x) && frames[1].is_near(x);
                 if near {
-                    alone.push(Alone { at, nearest: f32::INFINITY });
+                    alone.push(Alone { at, free: 0.0 });
                 }
             }
         }
@@ -305,8 +308,8 @@ impl Columns<'_, '_> {
                 }
                 while strange != 0 {
                     let lane = strange.trailing_zeros();
-                    let nearest = nearest[lane as usize % MOST];
-                    alone.push(Alone { at: at as u32 + lane, nearest });
+                    let free = free_before(nearest[lane as usize % MOST]);
+                    alone.push(Alone { at: at as u32 + lane, free });
                     strange &= strange - 1;
                 }
             } else {
@@ -319,14 +322,20 @@ impl Columns<'_, '_> {
                 }
                 while strange != 0 {
                     let lane = strange.trailing_zeros();
-                    let nearest = nearest[lane as usize % MOST];
+                    let free = free_before(nearest[lane as usize % MOST]);
                     let at = (at + column) as u32 + lane * region.width;
-                    alone.push(Alone { at, nearest });
+                    alone.push(Alone { at, free });
                     strange &= strange - 1;
                 }
             }
         }
     }
+}
+
+/// The depth from which a pixel's own ray looks for ground, if the nearest that is seen
+/// around it has this inverse depth.
+fn free_before(nearest: f32) -> f32 {
+    if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 }
 }
 
 /// The numbers of the lanes.

@@ -821,7 +821,7 @@ pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
 
 /// Place of cells among the posts of their tile.
 #[inline(always)]
-fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
+pub(crate) fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
     let mask = L::I::splat(TILE_CELLS as i32 - 1);
     let ring = L::I::splat(TILE_RING as i32);
     let row = (cell[1] & mask) + ring;
@@ -830,7 +830,7 @@ fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
 
 /// Place of blocks of `1 << level` cells among the maxima of their tile; level from 1.
 #[inline(always)]
-fn maximum<L: Lanes>(block: [L::I; 2], level: L::I) -> L::I {
+pub(crate) fn maximum<L: Lanes>(block: [L::I; 2], level: L::I) -> L::I {
     // A tile has `1 << bits` blocks along a side. The levels of maxima lie one after
     // another, so those of this one begin behind (4^8 - 4^(bits + 1)) / 3 others; the
     // product is that third to the last unit.

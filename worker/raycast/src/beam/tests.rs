@@ -5,7 +5,7 @@ use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
 use crate::oracle::{Dice, Land, lands};
 use crate::path::Ground;
-use crate::progress::{path, squares};
+use crate::painter::{path, squares};
 use crate::tests_support::{Plan, mountains, noise};
 use crate::{View, render};
 use glam::DVec3;

@@ -5,6 +5,8 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -25,6 +27,7 @@ impl Lanes for Eight {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -229,6 +232,17 @@ impl Ints for I {
             let low = _mm256_mask_i64gather_epi32::<1>(none, nowhere, low, of_low);
             let high = _mm256_mask_i64gather_epi32::<1>(none, nowhere, high, of_high);
             I(_mm256_set_m128i(high, low))
+        }
+    }
+    #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+            let none = _mm256_setzero_si256();
+            let mask = _mm256_castps_si256(mask.0);
+            I(_mm256_mask_i32gather_epi32::<2>(none, table.as_ptr().cast(), at, mask))
         }
     }
     #[inline(always)]

@@ -2,6 +2,8 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -21,6 +23,7 @@ impl Lanes for Sixteen {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -224,6 +227,16 @@ impl Ints for I {
             let low = _mm512_mask_i64gather_epi32::<1>(none, mask.0 as u8, low, nowhere);
             let high = _mm512_mask_i64gather_epi32::<1>(none, of_high, high, nowhere);
             I(_mm512_inserti64x4::<1>(_mm512_castsi256_si512(low), high))
+        }
+    }
+    #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+            let none = _mm512_setzero_si512();
+            I(_mm512_mask_i32gather_epi32::<2>(none, mask.0, at, table.as_ptr().cast()))
         }
     }
     #[inline(always)]

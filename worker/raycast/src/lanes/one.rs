@@ -1,5 +1,7 @@
 //! A single lane: the scalar twin of every kernel.
 
+mod doubles;
+
 use super::{Floats, Ints, Lanes, MOST, Mask};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -18,6 +20,7 @@ impl Lanes for One {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 macro_rules! operator {
@@ -199,6 +202,14 @@ impl Ints for I {
         let at = (at.0 as u32).min(last.0 as u32) as usize;
         // SAFETY: the caller has seen that so much can be read.
         I(unsafe { bases[0].add(at).cast::<i32>().read_unaligned() })
+    }
+    #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        if !mask.0 {
+            return I(0);
+        }
+        let at = (at.0 as u32 as usize).min(table.len() - 2);
+        I((u32::from(table[at]) | u32::from(table[at + 1]) << 16) as i32)
     }
     #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
