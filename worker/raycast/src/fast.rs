@@ -1,7 +1,7 @@
 //! The methods that trade accuracy for speed: which one a view gets, and what it sees.
 
 use crate::View;
-use crate::column::Columns;
+use crate::column::{self, Columns};
 use crate::field::Field;
 use crate::lanes;
 use crate::lod::Lod;
@@ -79,7 +79,9 @@ pub(crate) fn see(
     region: Region,
     method: Method,
 ) -> Result<(Seen, Vec<TileKey>), Unfit> {
-    let relief = Relief::new(field, view);
+    let tolerance_px = view.quality.tolerance_px;
+    let share = if method == Method::Column { column::LEVELS } else { 1.0 };
+    let relief = Relief::new(field, view, share * tolerance_px);
     let (relief, camera) = (&relief, &view.camera);
     let seen = match method {
         Method::Lod => {
@@ -87,7 +89,6 @@ pub(crate) fn see(
             lanes::run(Lod { field, relief, view, region, slack }, lanes::widest())
         }
         Method::Column => {
-            let tolerance_px = view.quality.tolerance_px;
             lanes::run(Columns { relief, camera, tolerance_px, region }, lanes::widest())
         }
     };

@@ -243,3 +243,8 @@ pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
     }
 }
 
+/// Floats as the bits that they are.
+pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
+    // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
+    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
+}

@@ -2,7 +2,8 @@
 
 use crate::field::{Field, Ground, tile_key};
 use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
-use crate::walk::{as_bits, maximum, post};
+use crate::lanes::as_bits;
+use crate::walk::{maximum, post};
 use terrafarm_terrain::layout::TILE_POSTS;
 use terrafarm_terrain::tile::{Codes, Heights, MAXIMA_LEVELS, VOID};
 
