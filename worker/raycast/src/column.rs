@@ -68,6 +68,11 @@ struct Span {
 /// `first_line`.
 struct Net {
     answers: Vec<f32>,
+    /// By the first of the four answers around a cell of the net: 1 if here or in one of
+    /// the eight cells around the four are not of neighbouring ground, else 0.
+    breaks: Vec<f32>,
+    /// The same without the cells around.
+    own_breaks: Vec<f32>,
     width: usize,
     first_ray: usize,
     first_line: i32,
@@ -80,7 +85,13 @@ impl Kernel for Columns<'_, '_> {
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
         let mut seen = Seen::new(self.region);
-        let mut net = Net { answers: Vec::new(), width: 0, first_ray: 0, first_line: 0 };
+        let mut net = Net {
+            answers: Vec::new(),
+            breaks: Vec::new(),
+            own_breaks: Vec::new(),
+            width: 0, first_ray: 0,
+            first_line: 0,
+        };
         let mut alone = Vec::new();
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
@@ -126,6 +137,40 @@ impl Kernel for Columns<'_, '_> {
     }
 }
 
+impl Net {
+    /// Finds the cells where the picture breaks, and their neighbours.
+    #[inline(always)]
+    fn compare<L: Lanes>(&mut self) {
+        let Net { answers, breaks, own_breaks, width, .. } = self;
+        let (width, count) = (*width, answers.len());
+        // A margin for the vectors beyond the end.
+        answers.resize(count + width + 2 * MOST, 0.0);
+        for list in [&mut *breaks, &mut *own_breaks] {
+            list.clear();
+            list.resize(count + width + 2 * MOST, 0.0);
+        }
+        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
+        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
+        for at in (0..count).step_by(L::N) {
+            let (a, b) = (L::F::load(&answers[at..]), L::F::load(&answers[at + 1..]));
+            let next = if at + width < count { at + width } else { at };
+            let (c, e) = (L::F::load(&answers[next..]), L::F::load(&answers[next + 1..]));
+            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
+            let same = (high * neighbours).le(low);
+            L::F::select(same, zero, one).store(&mut own_breaks[at..]);
+        }
+        for at in (1..count).step_by(L::N) {
+            let mut worst = zero;
+            for row in [at.saturating_sub(width).max(1), at, at + width] {
+                for place in [row - 1, row, row + 1] {
+                    worst = worst.max(L::F::load(&own_breaks[place..]));
+                }
+            }
+            worst.store(&mut breaks[at..]);
+        }
+    }
+}
+
 /// A region in parts that are not too wide along the minor axis: minors and majors.
 fn parts(region: Region, by_rows: bool) -> impl Iterator<Item = [Range<u32>; 2]> {
     let columns = region.x..region.x + region.width;
@@ -147,8 +192,8 @@ fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 
         let middle = f64::from(row) + 0.5;
         let line = |pixel: u32| fan.line(f64::from(pixel) + 0.5, middle);
         let (a, b) = (line(pixels.start), line(pixels.end - 1));
-        // One more on each side makes up for rounding.
-        let lines = a.min(b).floor() as i32 - 1..a.max(b).floor() as i32 + 3;
+        // One more on each side to compare with, and one makes up for rounding.
+        let lines = a.min(b).floor() as i32 - 2..a.max(b).floor() as i32 + 4;
         Span { pixels, lines }
     };
     rows.map(span).collect()
@@ -169,7 +214,8 @@ impl Columns<'_, '_> {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
         let rays = |row: u32| {
             let (before, rest) = fan.rays(row);
-            before..before + 1 + usize::from(rest > 0.0)
+            // And one more on each side to compare with.
+            before.saturating_sub(1)..before + 2 + usize::from(rest > 0.0)
         };
         let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
@@ -190,6 +236,7 @@ impl Columns<'_, '_> {
                 seen.steps += self.block::<L>(frame, fan, block, low..high, net);
             }
         }
+        net.compare::<L>();
     }
 
     /// Casts rays of N lines. Returns the steps that it took.
@@ -268,9 +315,10 @@ impl Columns<'_, '_> {
         let (ray, down) = fan.rays(row);
         let at = (ray - net.first_ray) * net.width;
         let before = &net.answers[at..at + net.width];
-        let after = if down > 0.0 { &net.answers[at + net.width..at + 2 * net.width] } else { before };
+        let next = if down > 0.0 { at + net.width } else { at };
+        let after = &net.answers[next..next + net.width];
+        let breaks = &net.breaks[at..at + net.width];
         let down = L::F::splat(down);
-        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
         let numbers = L::F::load(&NUMBERS);
         let sparse = scale < DENSEST;
         let region = self.region;
@@ -283,36 +331,34 @@ impl Columns<'_, '_> {
             let left = line.floor();
             let share = line - left.to_floats();
             let left = left - L::I::splat(net.first_line);
-            let [a, b, c, e] = if sparse {
+            let ((a, b), (c, e), broken) = if sparse {
                 left.store(&mut places);
                 let base = places[0].max(0) as usize;
                 let left = left - L::I::splat(base as i32);
-                [
-                    L::F::lookup(&before[base..], left),
-                    L::F::lookup(&before[base + 1..], left),
-                    L::F::lookup(&after[base..], left),
-                    L::F::lookup(&after[base + 1..], left),
-                ]
+                (
+                    looked_up::<L>(&before[base..], left),
+                    looked_up::<L>(&after[base..], left),
+                    L::F::lookup(&breaks[base..], left),
+                )
             } else {
-                let right = left + L::I::splat(1);
-                [
+                (
                     gathered::<L>(before, left),
-                    gathered::<L>(before, right),
                     gathered::<L>(after, left),
-                    gathered::<L>(after, right),
-                ]
+                    gathered::<L>(breaks, left).0,
+                )
             };
-            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
-            let close = (high * neighbours).le(low);
+            let high = a.max(b).max(c.max(e));
+            let close = broken.eq(L::F::splat(0.0));
             let (above, below) = (a + (b - a) * share, c + (e - c) * share);
             let guess = above + (below - above) * down;
             let count = L::N.min((pixels.end - pixel) as usize);
             let all = L::M::from_bits(u32::MAX >> (32 - count));
             let sky = high.eq(L::F::splat(0.0));
-            let ray = |n: usize| {
-                L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32)
-            };
-            let (answer, sure) = self.settle::<L>([ray(0), ray(1), ray(2)], guess, close & all & !sky);
+            let mut ray = [minor; 3];
+            for n in 0..3 {
+                ray[n] = L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32);
+            }
+            let (answer, sure) = self.settle::<L>(ray, guess, close & all & !sky);
             let close = sure | (sky & close);
             let mut strange = (!close).bits() & (u32::MAX >> (32 - count));
             if strange != 0 {
@@ -411,7 +457,16 @@ const NUMBERS: [f32; MOST] = {
     numbers
 };
 
+/// Elements of a row and those after them, the first less than 2 N further on.
 #[inline(always)]
-fn gathered<L: Lanes>(table: &[f32], at: L::I) -> L::F {
-    L::F::from_bits(L::I::gather(as_bits(table), at, !L::M::none()))
+fn looked_up<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    (L::F::lookup(row, at), L::F::lookup(&row[1..], at))
+}
+
+/// The same, however far on they are.
+#[inline(always)]
+fn gathered<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    let (row, all) = (as_bits(row), !L::M::none());
+    let next = at + L::I::splat(1);
+    (L::F::from_bits(L::I::gather(row, at, all)), L::F::from_bits(L::I::gather(row, next, all)))
 }
