@@ -73,6 +73,8 @@ impl Kernel for Abreast<'_, '_> {
 
 /// Lanes on their way.
 struct Walk<L: Lanes> {
+    /// Those that are not done.
+    active: L::M,
     /// The number of the ray.
     ray: L::I,
     cell: [L::I; 2],
@@ -238,53 +240,62 @@ impl Abreast<'_, '_> {
         }
     }
 
+    /// Casts all rays, by two sets of lanes in turn: each takes a step while the other
+    /// waits for the outcome of its own.
     #[inline(always)]
     fn walk<L: Lanes, const ROUND: bool>(&mut self) -> u64 {
-        let count = self.rays.count;
-        let mut walk = Walk::<L>::new();
-        let (zero, one) = (L::I::splat(0), L::I::splat(1));
-        let mut active = L::M::none();
+        let mut walks = [Walk::<L>::new(), Walk::<L>::new()];
         let (mut taken, mut steps) = (0, 0);
-        loop {
-            let idle = !active;
-            if taken < count && idle.count() as usize * IDLE_SHARE >= L::N {
-                walk.refill::<ROUND>(&self.sight, self.rays, taken, idle);
-                active = active | (idle & walk.u.lt(walk.last));
-                taken += idle.count() as usize;
-                continue;
-            }
-            if !active.any() {
-                return steps;
-            }
-            let cells = active & walk.level.eq(zero);
-            let blocks = active & !cells;
-            let exits = walk.exits::<ROUND>(&self.sight);
-            if cells.count() >= blocks.count() {
-                steps += u64::from(cells.count());
-                let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells);
-                if hits.any() {
-                    self.keep_hits(&walk, hits, u, z);
+        let mut left = true;
+        while left {
+            left = false;
+            for walk in &mut walks {
+                let idle = !walk.active;
+                if taken < self.rays.count && idle.count() as usize * IDLE_SHARE >= L::N {
+                    walk.refill::<ROUND>(&self.sight, self.rays, taken, idle);
+                    taken += idle.count() as usize;
                 }
-                if absent.any() {
-                    self.leave_open(&walk, absent);
+                if walk.active.any() {
+                    steps += self.step::<L, ROUND>(walk);
+                    left = true;
                 }
-                active = active & !(hits | absent);
-                let gone = walk.pass::<ROUND>(&self.sight, &exits, cells & active);
-                active = active & !gone;
-            } else {
-                steps += u64::from(blocks.count());
-                let (highest, absent) = self.tiles.maxima::<L>(walk.cell, walk.level, blocks);
-                let clear = blocks & walk.clears::<ROUND>(&exits, highest);
-                if absent.any() {
-                    self.leave_open(&walk, absent);
-                    active = active & !absent;
-                }
-                let down = blocks & !clear;
-                walk.level = L::I::select(down, walk.level - one, walk.level);
-                let beside = walk.beside(&self.sight, &exits);
-                let gone = walk.pass_beside::<ROUND>(&self.sight, &exits, clear & active, beside);
-                active = active & !gone;
             }
+            left |= taken < self.rays.count;
+        }
+        steps
+    }
+
+    /// Takes lanes that are at a block a step further, or those that are at a cell:
+    /// whichever are more. Returns how many.
+    #[inline(always)]
+    fn step<L: Lanes, const ROUND: bool>(&mut self, walk: &mut Walk<L>) -> u64 {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let cells = walk.active & walk.level.eq(zero);
+        let blocks = walk.active & !cells;
+        let exits = walk.exits::<ROUND>(&self.sight);
+        if cells.count() >= blocks.count() {
+            let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells);
+            if hits.any() {
+                self.keep_hits(walk, hits, u, z);
+            }
+            if absent.any() {
+                self.leave_open(walk, absent);
+            }
+            walk.active = walk.active & !(hits | absent);
+            walk.pass::<ROUND>(&self.sight, &exits, cells & walk.active);
+            u64::from(cells.count())
+        } else {
+            let (highest, absent) = self.tiles.maxima::<L>(walk.cell, walk.level, blocks);
+            let clear = blocks & walk.clears::<ROUND>(&exits, highest);
+            if absent.any() {
+                self.leave_open(walk, absent);
+                walk.active = walk.active & !absent;
+            }
+            let down = blocks & !clear;
+            walk.level = L::I::select(down, walk.level - one, walk.level);
+            let beside = walk.beside(&self.sight, &exits);
+            walk.pass_beside::<ROUND>(&self.sight, &exits, clear & walk.active, beside);
+            u64::from(blocks.count())
         }
     }
 
@@ -329,6 +340,7 @@ impl<L: Lanes> Walk<L> {
     fn new() -> Self {
         let (none, zero) = (L::D::splat(0.0), L::I::splat(0));
         Walk {
+            active: L::M::none(),
             ray: zero,
             cell: [zero; 2],
             level: zero,
@@ -395,6 +407,7 @@ impl<L: Lanes> Walk<L> {
             let cell = self.cell_after(sight, axis, self.u);
             self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
         }
+        self.active = self.active | (lanes & self.u.lt(self.last));
     }
 
     /// The cell of an axis in which the rays are just after `u`.
@@ -469,16 +482,11 @@ impl<L: Lanes> Walk<L> {
         )
     }
 
-    /// Goes on behind cells. Returns the lanes that have no more way to go.
+    /// Goes on behind cells; lanes that have no more way to go are done.
     #[inline(always)]
-    fn pass<const ROUND: bool>(
-        &mut self,
-        sight: &Sight,
-        exits: &Exits<L>,
-        lanes: L::M,
-    ) -> L::M {
+    fn pass<const ROUND: bool>(&mut self, sight: &Sight, exits: &Exits<L>, lanes: L::M) {
         let beside = L::I::select(exits.north, self.cell[0], self.cell[1]);
-        self.pass_beside::<ROUND>(sight, exits, lanes, beside)
+        self.pass_beside::<ROUND>(sight, exits, lanes, beside);
     }
 
     #[inline(always)]
@@ -488,7 +496,7 @@ impl<L: Lanes> Walk<L> {
         exits: &Exits<L>,
         lanes: L::M,
         beside: L::I,
-    ) -> L::M {
+    ) {
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
         let north = exits.north;
         self.u = L::D::select(lanes, exits.u, self.u);
@@ -513,7 +521,7 @@ impl<L: Lanes> Walk<L> {
                 gone = gone & !self.join(sight, joint);
             }
         }
-        gone
+        self.active = self.active & !gone;
     }
 
     /// Goes on in the next spans. Returns the lanes that need to.
