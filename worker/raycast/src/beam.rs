@@ -23,13 +23,13 @@
 
 mod abreast;
 
-use abreast::{Layer, Narrow, Squares};
 use crate::exact::{Globe, Tiles};
 use crate::field::{Cursor, Field, Ground, tile_key};
 use crate::grid::cells_of;
 use crate::lanes;
 use crate::path;
 use crate::pyramid::Pyramid;
+use abreast::{Layer, Narrow, Squares};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;

@@ -224,4 +224,3 @@ pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
         _ => kernel.run::<One>(),
     }
 }
-

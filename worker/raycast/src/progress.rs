@@ -1,15 +1,15 @@
 //! From a region to rays, and from colours to pixels; what is done and what is not.
 
 use crate::View;
-use crate::column::Columns;
-use crate::lanes;
-use crate::relief::Relief;
 use crate::beam::{Beams, WIDEST_PX};
+use crate::column::Columns;
 use crate::exact::{Exact, Many};
 use crate::field::{Contact, Field, Outcome};
+use crate::lanes;
 use crate::path::{Ground, Path};
 use crate::pyramid::Pyramid;
 use crate::reference::Reference;
+use crate::relief::Relief;
 use crate::shade::Shader;
 use crate::srgb;
 use glam::DVec3;
@@ -427,9 +427,26 @@ pub fn depths(
     let field = Field { resident, pyramid };
     if view.quality.method == Method::Column {
         if let Some(relief) = Relief::new(field, view) {
-            let columns = Columns { relief: &relief, camera: &view.camera, tolerance_px: view.quality.tolerance_px, region };
-            let seen = lanes::run(columns, std::env::var("WIDTH").map_or(lanes::widest(), |w| if w == "8" { lanes::Width::Eight } else if w == "1" { lanes::Width::One } else { lanes::widest() }));
-            let stats = Stats { hits: seen.fallen, rays: seen.rays, steps: seen.steps, ..Stats::default() };
+            let columns = Columns {
+                relief: &relief,
+                camera: &view.camera,
+                tolerance_px: view.quality.tolerance_px,
+                region,
+            };
+            let seen = lanes::run(
+                columns,
+                std::env::var("WIDTH").map_or(lanes::widest(), |w| {
+                    if w == "8" {
+                        lanes::Width::Eight
+                    } else if w == "1" {
+                        lanes::Width::One
+                    } else {
+                        lanes::widest()
+                    }
+                }),
+            );
+            let stats =
+                Stats { hits: seen.fallen, rays: seen.rays, steps: seen.steps, ..Stats::default() };
             let wanted = relief.wanted();
             if !wanted.is_empty() {
                 return Err(Missing(wanted));

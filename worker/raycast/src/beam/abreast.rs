@@ -3,7 +3,9 @@
 //! Does what `Beams::advance` does, over a single height layer. Bounds need not be the
 //! same to the bit: a beam is loose on the safe side by far more.
 
-use super::{CLEARANCE_M, FLAT_REACH_M, NARROWEST_PX, REACH_RAD, ROUNDING, SHORTEST_STEP, WIDEST_PX};
+use super::{
+    CLEARANCE_M, FLAT_REACH_M, NARROWEST_PX, REACH_RAD, ROUNDING, SHORTEST_STEP, WIDEST_PX,
+};
 use crate::exact::{Globe, Tiles};
 use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
 use terrafarm_common::camera::Camera;
@@ -114,10 +116,13 @@ impl Kernel for Narrow<'_, '_> {
             let mut at = 0;
             while at < squares.count {
                 let left = squares.count - at;
-                let lanes = if left < L::N { L::M::from_bits((1 << left) - 1) } else { !L::M::none() };
+                let lanes =
+                    if left < L::N { L::M::from_bits((1 << left) - 1) } else { !L::M::none() };
                 steps += match layer.globe {
                     None => layer.advance::<L, false>(squares, region, at, f64::from(side), lanes),
-                    Some(_) => layer.advance::<L, true>(squares, region, at, f64::from(side), lanes),
+                    Some(_) => {
+                        layer.advance::<L, true>(squares, region, at, f64::from(side), lanes)
+                    }
                 };
                 at += L::N;
             }
@@ -257,7 +262,9 @@ impl Layer<'_> {
             level = L::I::select(longer, level + one, level);
         }
         let mut clear = inside & !L::I::splat(1 << MAXIMA_LEVELS).lt(side);
-        for corner in [[first[0], first[1]], [last[0], last[1]], [last[0], first[1]], [first[0], last[1]]] {
+        for corner in
+            [[first[0], first[1]], [last[0], last[1]], [last[0], first[1]], [first[0], last[1]]]
+        {
             if clear.any() {
                 let (highest, _) = self.tiles.maxima::<L>(corner, level, clear);
                 clear = clear & highest.lt(lowest);

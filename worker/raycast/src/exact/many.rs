@@ -191,10 +191,16 @@ impl<'a> Layer<'a> {
         }
         let scale = layer.spacing.map(|spacing| 1.0 / spacing);
         let eye = camera.position;
+        let start = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
+        let slack = [0, 1].map(|axis| {
+            let largest = 1.0 + start[axis].abs() + f64::from(cells[axis]);
+            16.0 * f64::EPSILON * largest
+        });
         let sight = Sight {
             camera,
             globe: (ground.curvature() != 0.0).then(|| Globe::new(ground, eye.z)),
-            start: [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]),
+            start,
+            slack,
             scale,
             cells,
             highest: field.pyramid.highest(),

@@ -38,7 +38,10 @@ fn more_lands() -> Vec<Land> {
         Land::new("codes", one(Plan::heights([1e6, -3e6], [10.0, 7.0], [530, 700], quarters))),
         Land::new("holes", one(Plan::heights([0.0; 2], [0.3, 0.4], [771, 300], holed))),
         Land::new("one cell", one(Plan::heights([0.0; 2], [5.0; 2], [2, 2], quarters))),
-        Land::new("rough", one(Plan::heights([0.0; 2], [1.0; 2], [300, 40], |i, j| 9.0 * noise(i, j, 3)))),
+        Land::new(
+            "rough",
+            one(Plan::heights([0.0; 2], [1.0; 2], [300, 40], |i, j| 9.0 * noise(i, j, 3))),
+        ),
     ]
 }
 

@@ -27,11 +27,16 @@ pub(crate) struct Tiles<'a> {
 enum Soil<'a> {
     Codes(Codes<'a>),
     /// Heights as they are, as bits.
-    Floats { posts: &'a [u32], maxima: &'a [u32] },
+    Floats {
+        posts: &'a [u32],
+        maxima: &'a [u32],
+    },
     /// No surface at all.
     Void,
     /// It is not loaded; the index knows its maximum.
-    Absent { highest: f32 },
+    Absent {
+        highest: f32,
+    },
 }
 
 /// The corners of cells.
@@ -146,8 +151,7 @@ impl<'a> Tiles<'a> {
         let north = at + L::I::splat(TILE_POSTS as i32);
         let numbers = self.numbers::<L>(cell);
         let none = L::D::splat(0.0);
-        let mut corners =
-            Corners { heights: [none; 4], solid: L::M::none(), absent: L::M::none() };
+        let mut corners = Corners { heights: [none; 4], solid: L::M::none(), absent: L::M::none() };
         let mut rest = lanes;
         while rest.any() {
             let here = self.alike::<L>(numbers, rest);
