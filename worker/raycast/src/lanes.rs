@@ -15,10 +15,6 @@ mod avx2;
 mod avx512;
 mod one;
 
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx2::Eight;
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx512::Sixteen;
 pub(crate) use one::One;
 
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};

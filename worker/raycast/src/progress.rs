@@ -232,7 +232,8 @@ impl<'a> Painter<'a> {
         self.rays += self.many.len() as u64;
         let samples = (self.samples * self.samples) as usize;
         let share = 1.0 / samples as f32;
-        for (number, [x, y]) in std::mem::take(&mut self.pixels).into_iter().enumerate() {
+        let mut pixels = std::mem::take(&mut self.pixels);
+        for (number, &[x, y]) in pixels.iter().enumerate() {
             let mut sum = [0.0f32; 3];
             let mut complete = true;
             for ray in number * samples..(number + 1) * samples {
@@ -246,6 +247,8 @@ impl<'a> Painter<'a> {
             }
         }
         self.many.clear();
+        pixels.clear();
+        self.pixels = pixels;
     }
 
     fn sample(&mut self, ray: usize) -> Option<LinearRgb> {
