@@ -61,6 +61,7 @@ pub(crate) trait Floats:
     fn floor(self) -> Self::I;
     /// The same bits.
     fn from_bits(bits: Self::I) -> Self;
+    fn to_bits(self) -> Self::I;
     /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
     /// if the table has fewer.
     fn lookup(table: &[f32], at: Self::I) -> Self;
@@ -125,12 +126,24 @@ pub(crate) trait Ints:
     fn eq(self, other: Self) -> Self::M;
     fn lt(self, other: Self) -> Self::M;
     fn select(mask: Self::M, yes: Self, no: Self) -> Self;
+    /// For each lane in `mask` the 32 bits `at` bytes behind its base, or `last` bytes
+    /// behind if `at`, unsigned, is more than that; lanes outside get 0.
+    ///
+    /// # Safety
+    /// For each lane in `mask`, `last + 4` bytes from its base can be read.
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: Self, last: Self, mask: Self::M) -> Self;
     /// For each lane in `mask` the elements `at` (low half) and `at + 1` (high half) of a
     /// table of at least two; lanes outside get 0. An index outside the table reads from
     /// its end.
     fn gather_pairs(table: &[u16], at: Self, mask: Self::M) -> Self;
     /// The same for single elements of 32 bits.
     fn gather(table: &[u32], at: Self, mask: Self::M) -> Self;
+    /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
+    /// lanes outside get 0. An index outside the table reads from its end.
+    fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
+    /// For each lane in `mask` the elements `at` to `at + 3` of a table of at least four,
+    /// as pairs; as above.
+    fn gather_fours(table: &[u16], at: Self, mask: Self::M) -> (Self, Self);
 }
 
 /// A yes or no a lane.

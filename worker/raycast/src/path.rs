@@ -220,6 +220,11 @@ impl Path {
         self.span(index)
     }
 
+    /// Straight distance in space from the start to the ray's point at `u`, metres.
+    pub(crate) fn distance_at(&self, u: f64) -> f64 {
+        self.distance(u, self.exact_z(u))
+    }
+
     /// Straight distance in space from the start to the point at `u`, metres.
     pub(crate) fn distance(&self, u: f64, z: f64) -> f64 {
         let k = self.ground.curvature;

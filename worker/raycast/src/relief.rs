@@ -28,7 +28,7 @@ pub(crate) struct Relief<'a> {
     number: usize,
     layer: &'a Layer,
     /// Vertical distance that the tolerance allows at a distance of 1 m.
-    tolerance: f64,
+    pub tolerance: f64,
     /// The camera: the cell it is over, its place in it, its height, metres.
     pub eye_cell: [i32; 2],
     pub eye_place: [f32; 2],
@@ -71,15 +71,11 @@ pub(crate) enum Soil<'a> {
 }
 
 impl<'a> Relief<'a> {
-    /// `None` if the store has no height layer, more than one, or one without cells.
-    pub(crate) fn new(field: Field<'a>, view: &View) -> Option<Self> {
-        let index = field.index();
-        let mut layers = index.layers_of(LayerKind::Height);
-        let (number, layer) = layers.next()?;
+    /// The store must have one height layer, with at least one cell.
+    pub(crate) fn new(field: Field<'a>, view: &View) -> Self {
+        let (number, layer) =
+            field.index().layers_of(LayerKind::Height).next().expect("the store has heights");
         let cells = cells_of(layer);
-        if layers.next().is_some() || cells.contains(&0) {
-            return None;
-        }
         let camera = &view.camera;
         let place = [0, 1].map(|axis| {
             let place = (camera.position[axis] - layer.origin[axis]) / layer.spacing[axis];
@@ -92,7 +88,7 @@ impl<'a> Relief<'a> {
             plots: Vec::new(),
             wanted: Vec::new(),
         };
-        Some(Relief {
+        Relief {
             field,
             number,
             layer,
@@ -105,7 +101,7 @@ impl<'a> Relief<'a> {
             curvature: Ground::new(view.shading.earth).curvature(),
             plots,
             known: RefCell::new(known),
-        })
+        }
     }
 
     /// The plot with a number: `row * plots[0] + column`.
@@ -120,9 +116,12 @@ impl<'a> Relief<'a> {
         self.meet(number)
     }
 
-    /// Tiles that were needed but not loaded.
+    /// Tiles that were needed but not loaded, sorted, each once.
     pub(crate) fn wanted(&self) -> Vec<TileKey> {
-        self.known.borrow().wanted.clone()
+        let mut wanted = self.known.borrow().wanted.clone();
+        wanted.sort_unstable();
+        wanted.dedup();
+        wanted
     }
 
     #[cold]

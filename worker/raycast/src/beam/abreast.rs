@@ -30,6 +30,8 @@ pub(super) struct Layer<'a> {
     pub(super) highest: f64,
     /// Shortest side of a cell, metres.
     pub(super) finest_step: f64,
+    /// Room to be kept above the ground, metres for each metre away.
+    pub(super) slack: f64,
     pub(super) tiles: Tiles<'a>,
 }
 
@@ -58,6 +60,8 @@ struct Bounds<L: Lanes> {
     high: [L::D; 3],
     across_squared: L::D,
     reach: L::D,
+    /// Length of the longest ray at depth 1.
+    longest: L::D,
 }
 
 impl Squares {
@@ -178,8 +182,9 @@ impl Layer<'_> {
             Some(globe) => REACH_RAD / globe.curvature,
             None => FLAT_REACH_M,
         };
-        let reach = L::D::splat(reach).div(longest.sqrt());
-        Bounds { low, high, across_squared: x * x + y * y, reach }
+        let longest = longest.sqrt();
+        let reach = L::D::splat(reach).div(longest);
+        Bounds { low, high, across_squared: x * x + y * y, reach, longest }
     }
 
     /// Goes on with N beams as far as they are free.
@@ -208,7 +213,8 @@ impl Layer<'_> {
             if let (true, Some(globe)) = (ROUND, &self.globe) {
                 rise = globe.rise::<L>(bounds.across_squared * free * free, rise);
             }
-            let lowest = eye_z + rise - L::D::splat(CLEARANCE_M);
+            let room = L::D::splat(self.slack) * end * bounds.longest;
+            let lowest = eye_z + rise - L::D::splat(CLEARANCE_M) - room;
             let away = active & level_or_up & L::D::splat(self.highest).lt(lowest);
             free = L::D::select(away, L::D::splat(f64::INFINITY), free);
             active = active & !away;

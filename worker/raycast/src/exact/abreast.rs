@@ -35,8 +35,8 @@ use super::arc::{Globe, Rise, Spans};
 use super::rays::{Part, Rays, Verdict};
 use super::tiles::Tiles;
 use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
+use crate::painter::ROUNDING;
 use crate::path::{FLAT_REACH_M, REACH_RAD};
-use crate::progress::ROUNDING;
 use terrafarm_common::camera::Camera;
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
@@ -76,18 +76,18 @@ impl Kernel for Abreast<'_, '_> {
 
     #[inline(always)]
     fn run<L: Lanes>(mut self) -> u64 {
-        match self.sight.globe {
+        let steps = match self.sight.globe {
             None => {
                 self.aim::<L, false>();
                 self.walk::<L, false>()
             }
-            Some(globe) => {
+            Some(_) => {
                 self.aim::<L, true>();
-                let steps = self.walk::<L, true>();
-                self.measure::<L>(&globe);
-                steps
+                self.walk::<L, true>()
             }
-        }
+        };
+        self.measure::<L>();
+        steps
     }
 }
 
@@ -247,16 +247,17 @@ impl Abreast<'_, '_> {
         value.store(&mut self.rays.part_mut(part)[at..]);
     }
 
-    /// Distances of all contacts over a round Earth.
+    /// One over the depths of all contacts.
     #[inline(always)]
-    fn measure<L: Lanes>(&mut self, globe: &Globe) {
+    fn measure<L: Lanes>(&mut self) {
+        let [x, y, z] = self.sight.camera.forward.to_array();
         let mut at = 0;
         while at < self.rays.count {
-            let across = self.load::<L>(Part::Across, at);
-            let rise = Rise::<L> { across, up: self.load::<L>(Part::DirectionZ, at) };
-            let (u, z) = (self.load::<L>(Part::U, at), self.load::<L>(Part::Z, at));
-            let distance = globe.distance(&rise, u, z);
-            self.store::<L>(Part::Distance, at, distance);
+            let along_axis = self.load::<L>(Part::DirectionX, at) * L::D::splat(x)
+                + self.load::<L>(Part::DirectionY, at) * L::D::splat(y)
+                + self.load::<L>(Part::DirectionZ, at) * L::D::splat(z);
+            let depth = self.load::<L>(Part::U, at) * along_axis;
+            self.store::<L>(Part::InverseDepth, at, L::D::splat(1.0).div(depth));
             at += L::N;
         }
     }

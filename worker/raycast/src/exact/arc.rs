@@ -90,17 +90,6 @@ impl Globe {
         let slope = (L::D::splat(4.0) * middle - end).div(length);
         Spans { number, start_u, end_u, start_z, end_z, slope, bend }
     }
-
-    /// Straight distance in space from the camera to points of rays.
-    #[inline(always)]
-    pub(super) fn distance<L: Lanes>(&self, rise: &Rise<L>, u: L::D, z: L::D) -> L::D {
-        let k = L::D::splat(self.curvature);
-        let (_, versine) = sinc_versine::<L>(rise.across * (u * k) * (u * k));
-        let r0 = L::D::splat(2.0 * (1.0 / self.curvature + self.eye_z));
-        let r1 = L::D::splat(1.0 / self.curvature) + z;
-        let drop = z - L::D::splat(self.eye_z);
-        (drop * drop + r0 * r1 * versine).sqrt()
-    }
 }
 
 impl<L: Lanes> Spans<L> {

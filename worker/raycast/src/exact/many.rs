@@ -7,8 +7,8 @@ use super::tiles::Tiles;
 use crate::field::{Contact, Cursor, Field, Ground, Outcome, corners_in, tile_key};
 use crate::grid::cells_of;
 use crate::lanes::{self, Width};
+use crate::painter::{Caster, path};
 use crate::path::{self, Path};
-use crate::progress::{Caster, path};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Method;
@@ -114,7 +114,8 @@ impl<'a> Many<'a> {
         }
         if let Outcome::Hit(contact) = &outcome {
             self.rays.part_mut(Part::U)[ray] = contact.u;
-            self.rays.part_mut(Part::Distance)[ray] = path.distance(contact.u, contact.z);
+            let along_axis = path.direction.dot(self.camera.forward);
+            self.rays.part_mut(Part::InverseDepth)[ray] = 1.0 / (contact.u * along_axis);
         }
         self.outcomes[ray] = outcome;
     }
@@ -132,11 +133,16 @@ impl<'a> Many<'a> {
         DVec3::new(part(Part::DirectionX), part(Part::DirectionY), part(Part::DirectionZ))
     }
 
-    /// Straight distance to what a ray met, metres.
+    /// Parameter of the path at which a ray met the surface.
     #[inline]
-    pub(crate) fn distance(&self, ray: usize) -> f64 {
-        let flat = self.ground.curvature() == 0.0;
-        self.rays.part(if flat { Part::U } else { Part::Distance })[ray]
+    pub(crate) fn parameter(&self, ray: usize) -> f64 {
+        self.rays.part(Part::U)[ray]
+    }
+
+    /// One over the depth of what a ray met, per metre; see [`crate::Depths`].
+    #[inline]
+    pub(crate) fn inverse_depth(&self, ray: usize) -> Option<f32> {
+        self.is_hit(ray)?.then(|| self.rays.part(Part::InverseDepth)[ray] as f32)
     }
 
     /// Whether a ray met the surface; `None` if it cannot be told for want of a tile.

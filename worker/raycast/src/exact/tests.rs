@@ -4,8 +4,8 @@ use super::{Exact, Many};
 use crate::field::{Contact, Field, Outcome};
 use crate::lanes::Width;
 use crate::oracle::{Dice, Land, lands};
+use crate::painter::path;
 use crate::path::Ground;
-use crate::progress::path;
 use crate::tests_support::{Plan, mountains, noise};
 use glam::DVec3;
 use std::collections::BTreeSet;
@@ -121,8 +121,9 @@ fn every_width_finds_the_same_bits_as_the_slow_twin() {
                     assert_eq!(bits(&found), bits(truth), "{}", what());
                     let (path, _) = many.path(ray);
                     if let Outcome::Hit(contact) = &found {
-                        let distance = path.distance(contact.u, contact.z);
-                        assert_eq!(many.distance(ray).to_bits(), distance.to_bits(), "{}", what());
+                        let depth = contact.u * path.direction.dot(camera.forward);
+                        let inverse = (1.0 / depth) as f32;
+                        assert_eq!(many.inverse_depth(ray), Some(inverse), "{}", what());
                         hits += 1;
                     } else {
                         misses += 1;

@@ -7,7 +7,7 @@
 
 mod doubles;
 
-use super::{Floats, Ints, Kernel, Lanes, Mask};
+use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -142,6 +142,11 @@ impl Floats for F {
         unsafe { F(_mm256_castsi256_ps(bits.0)) }
     }
     #[inline(always)]
+    fn to_bits(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_castps_si256(self.0)) }
+    }
+    #[inline(always)]
     fn lookup(table: &[f32], at: I) -> F {
         let table = &table[..16];
         // SAFETY: see the page of this module.
@@ -211,6 +216,25 @@ impl Ints for I {
         unsafe { I(_mm256_blendv_epi8(no.0, yes.0, _mm256_castps_si256(mask.0))) }
     }
     #[inline(always)]
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: I, last: I, mask: M) -> I {
+        // SAFETY: see the page of this module; the caller has seen that so much can be read.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, last.0);
+            let mask = _mm256_castps_si256(mask.0);
+            let low = _mm256_cvtepu32_epi64(_mm256_castsi256_si128(at));
+            let high = _mm256_cvtepu32_epi64(_mm256_extracti128_si256::<1>(at));
+            let low = _mm256_add_epi64(low, _mm256_loadu_si256(bases.as_ptr().cast()));
+            let high = _mm256_add_epi64(high, _mm256_loadu_si256(bases[4..].as_ptr().cast()));
+            let none = _mm_setzero_si128();
+            let of_low = _mm256_castsi256_si128(mask);
+            let of_high = _mm256_extracti128_si256::<1>(mask);
+            let nowhere = std::ptr::null();
+            let low = _mm256_mask_i64gather_epi32::<1>(none, nowhere, low, of_low);
+            let high = _mm256_mask_i64gather_epi32::<1>(none, nowhere, high, of_high);
+            I(_mm256_set_m128i(high, low))
+        }
+    }
+    #[inline(always)]
     fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
         let last = (table.len().min(i32::MAX as usize) - 2) as i32;
         // SAFETY: see the page of this module; element `last + 1` is inside the table.
@@ -231,6 +255,45 @@ impl Ints for I {
             let mask = _mm256_castps_si256(mask.0);
             I(_mm256_mask_i32gather_epi32::<4>(none, table.as_ptr().cast(), at, mask))
         }
+    }
+    #[inline(always)]
+    fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
+    }
+    #[inline(always)]
+    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
+        // SAFETY: see the page of this module; element `last + 3` is inside the table.
+        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    }
+}
+
+/// Eight bytes a lane from a table of elements of `SIZE` bytes; their low and high halves.
+///
+/// # Safety
+/// As every block here; and eight bytes from element `last` on must be readable.
+#[inline(always)]
+unsafe fn gather_eights<const SIZE: i32>(table: *const i64, at: I, last: i32, mask: M) -> (I, I) {
+    // SAFETY: by this function's own condition.
+    unsafe {
+        let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+        let mask = _mm256_castps_si256(mask.0);
+        let none = _mm256_setzero_si256();
+        let few = _mm256_cvtepi32_epi64(_mm256_castsi256_si128(mask));
+        let rest = _mm256_cvtepi32_epi64(_mm256_extracti128_si256::<1>(mask));
+        let (start, end) = (_mm256_castsi256_si128(at), _mm256_extracti128_si256::<1>(at));
+        let first = _mm256_mask_i32gather_epi64::<SIZE>(none, table, start, few);
+        let second = _mm256_mask_i32gather_epi64::<SIZE>(none, table, end, rest);
+        let (first, second) = (_mm256_castsi256_ps(first), _mm256_castsi256_ps(second));
+        // Halves of four bytes next to each other, then in the order of the lanes.
+        let low = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(first, second));
+        let high = _mm256_castps_si256(_mm256_shuffle_ps::<0b11_01_11_01>(first, second));
+        (
+            I(_mm256_permute4x64_epi64::<0b11_01_10_00>(low)),
+            I(_mm256_permute4x64_epi64::<0b11_01_10_00>(high)),
+        )
     }
 }
 
