@@ -161,7 +161,8 @@ impl Net {
         }
         for at in (1..count).step_by(L::N) {
             let mut worst = zero;
-            for row in [at.saturating_sub(width).max(1), at, at + width] {
+            let above = if at > width { at - width } else { at };
+            for row in [above, at, at + width] {
                 for place in [row - 1, row, row + 1] {
                     worst = worst.max(L::F::load(&own_breaks[place..]));
                 }
@@ -213,9 +214,9 @@ impl Columns<'_, '_> {
     ) {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
         let rays = |row: u32| {
-            let (before, rest) = fan.rays(row);
-            // And one more on each side to compare with.
-            before.saturating_sub(1)..before + 2 + usize::from(rest > 0.0)
+            // The row is between ray n and ray n + 1; one more on each side to compare with.
+            let (before, _) = fan.rays(row);
+            before.saturating_sub(1)..before + 3
         };
         let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);

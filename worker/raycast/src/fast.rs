@@ -3,7 +3,7 @@
 use crate::View;
 use crate::column::{self, Columns};
 use crate::field::Field;
-use crate::lanes;
+use crate::lanes::{self, Width};
 use crate::lod::Lod;
 use crate::relief::Relief;
 use crate::seen::{Seen, Unfit};
@@ -78,6 +78,7 @@ pub(crate) fn see(
     view: &View,
     region: Region,
     method: Method,
+    width: Width,
 ) -> Result<(Seen, Vec<TileKey>), Unfit> {
     let tolerance_px = view.quality.tolerance_px;
     let share = if method == Method::Column { column::LEVELS } else { 1.0 };
@@ -86,10 +87,10 @@ pub(crate) fn see(
     let seen = match method {
         Method::Lod => {
             let slack = relief.tolerance;
-            lanes::run(Lod { field, relief, view, region, slack }, lanes::widest())
+            lanes::run(Lod { field, relief, view, region, slack }, width)
         }
         Method::Column => {
-            lanes::run(Columns { relief, camera, tolerance_px, region }, lanes::widest())
+            lanes::run(Columns { relief, camera, tolerance_px, region }, width)
         }
     };
     Ok((seen, relief.wanted()))
@@ -124,3 +125,6 @@ pub(crate) fn map_distances(
         *s = across as f32 / inverse;
     }
 }
+
+#[cfg(test)]
+mod tests;

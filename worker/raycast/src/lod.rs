@@ -4,17 +4,19 @@ use crate::View;
 use crate::beam::Beams;
 use crate::field::Field;
 use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST};
+use crate::lattice::Frame;
 use crate::painter::squares;
 use crate::path::Ground;
 use crate::relief::Relief;
 use crate::seen::Seen;
 use crate::walk::{Lines, Rows, Walk};
+use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
 
 /// The least part of a ray along the map, for one along the axis: straight down has no
 /// direction on the map.
-const STRAIGHT_DOWN: f64 = 1e-6;
+const STRAIGHT_DOWN: f32 = 1e-6;
 
 /// Blocks of `1 << FIRST_BLOCK` cells are looked at first.
 const FIRST_BLOCK: i32 = 2;
@@ -76,32 +78,36 @@ pub(crate) fn cast_pixels<L: Lanes>(
     inverse_depth: &mut [f32],
 ) -> u64 {
     let mut steps = 0;
+    let frame = Frame::new(camera, true);
+    let part = |vector: DVec3| vector.as_vec3().to_array();
+    let (corner, right, down) = (part(frame.corner), part(frame.minor), part(frame.major));
+    let zero = L::F::splat(0.0);
     for pixels in pixels.chunks(L::N) {
-        let mut values = [[0.0f32; MOST]; 5];
+        let mut values = [[0.0f32; MOST]; 3];
         let mut places = [0; MOST];
         for lane in 0..L::N {
             // What is left over of the last lanes repeats the last pixel.
             let Alone { at, free } = pixels[lane.min(pixels.len() - 1)];
-            let [x, y] = [region.x + at % region.width, region.y + at / region.width];
-            let ray = camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            let length = (ray.x * ray.x + ray.y * ray.y).sqrt();
-            let (along_x, along_y, length) = if length < STRAIGHT_DOWN {
-                (1.0, 0.0, STRAIGHT_DOWN)
-            } else {
-                (ray.x / length, ray.y / length, length)
-            };
-            for (value, part) in values.iter_mut().zip([along_x, along_y, length, ray.z]) {
-                value[lane] = part as f32;
-            }
-            values[4][lane] = free * length as f32;
+            values[0][lane] = (region.x + at % region.width) as f32 + 0.5;
+            values[1][lane] = (region.y + at / region.width) as f32 + 0.5;
+            values[2][lane] = free;
             places[lane] = at as i32;
             inverse_depth[at as usize] = 0.0;
         }
-        let zero = L::F::splat(0.0);
+        let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
+        let mut ray = [zero; 3];
+        for n in 0..3 {
+            ray[n] = L::F::splat(corner[n])
+                + x * L::F::splat(right[n])
+                + y * L::F::splat(down[n]);
+        }
+        let across = (ray[0] * ray[0] + ray[1] * ray[1]).sqrt();
+        let across = across.max(L::F::splat(STRAIGHT_DOWN));
+        let inverse = L::F::splat(1.0).div(across);
         let rows = Rows {
-            rise: L::F::load(&values[3]),
+            rise: ray[2],
             higher: zero,
-            length: L::F::load(&values[2]),
+            length: across,
             longer: zero,
             first: 0.0,
             step: 0.0,
@@ -109,9 +115,9 @@ pub(crate) fn cast_pixels<L: Lanes>(
             at: L::I::load(&places),
             pitch: 0,
         };
-        let direction = [L::F::load(&values[0]), L::F::load(&values[1])];
-        let lines = Lines::<L>::new(relief, direction);
-        let mut walk = Walk::new(relief, lines, rows, L::F::load(&values[4]), FIRST_BLOCK);
+        let lines = Lines::<L>::new(relief, [ray[0] * inverse, ray[1] * inverse]);
+        let free = L::F::load(&values[2]) * across;
+        let mut walk = Walk::new(relief, lines, rows, free, FIRST_BLOCK);
         walk.run(inverse_depth);
         steps += walk.looked;
     }

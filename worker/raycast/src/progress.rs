@@ -3,6 +3,7 @@
 use crate::View;
 use crate::fast::{self, Look};
 use crate::field::Field;
+use crate::lanes;
 use crate::painter::Painter;
 use crate::pyramid::Pyramid;
 use crate::seen::Unfit;
@@ -114,7 +115,7 @@ impl Progress {
     ) -> Result<(), Unfit> {
         let samples = view.quality.samples_per_side.clamp(1, Quality::MAX_SAMPLES_PER_SIDE);
         let (fine, region) = fast::supersampled(view, self.region, samples);
-        let (seen, wanted) = fast::see(field, &fine, region, method)?;
+        let (seen, wanted) = fast::see(field, &fine, region, method, lanes::widest())?;
         missing.extend(wanted);
         self.stats.rays += seen.rays;
         self.stats.steps += seen.steps;

@@ -192,7 +192,7 @@ pub fn depths(
         if let Err(tile) = field.is_below(view.camera.position) {
             return Err(Unseen::Missing(vec![tile]));
         }
-        let (seen, wanted) = fast::see(field, view, region, method)?;
+        let (seen, wanted) = fast::see(field, view, region, method, lanes::widest())?;
         if !wanted.is_empty() {
             return Err(Unseen::Missing(wanted));
         }

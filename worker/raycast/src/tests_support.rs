@@ -101,6 +101,10 @@ fn build_layer(number: usize, plan: Plan, tiles: &mut Vec<(TileKey, Tile)>) -> L
     };
     let Plan { origin, spacing, posts, mut samples } = plan;
     let mut layer = Layer { kind, origin, spacing, posts, levels: Vec::new() };
+    let finest = match &samples {
+        Samples::Heights(heights) => heights.clone(),
+        Samples::Colors(_) => Vec::new(),
+    };
     for level in 0..Layer::level_count(posts) {
         let size = layer.level_posts(level);
         if level > 0 {
@@ -112,9 +116,8 @@ fn build_layer(number: usize, plan: Plan, tiles: &mut Vec<(TileKey, Tile)>) -> L
             for tx in 0..count[0] {
                 let key = TileKey { layer: number as u16, level: level as u16, tx, ty };
                 let (mut entry, tile) = samples.tile(size, tx, ty);
-                if level > 0 {
-                    // Nobody has measured it.
-                    entry.deviation = f32::INFINITY;
+                if let (true, Samples::Heights(heights)) = (level > 0, &samples) {
+                    entry.deviation = deviation(&finest, posts, heights, size, key);
                 }
                 entries.push(entry);
                 if let Some(tile) = tile {
@@ -125,6 +128,38 @@ fn build_layer(number: usize, plan: Plan, tiles: &mut Vec<(TileKey, Tile)>) -> L
         layer.levels.push(Level { tiles: count, entries });
     }
     layer
+}
+
+/// The largest distance between a tile of a coarse level and level 0: that at the posts of
+/// level 0, between which both are bilinear. Infinite with a void.
+fn deviation(fine: &[f32], posts: [u64; 2], coarse: &[f32], size: [u64; 2], key: TileKey) -> f32 {
+    let side = (TILE_CELLS as u64) << key.level;
+    let range = |tile: u32, axis: usize| {
+        let first = u64::from(tile) * side;
+        first..(first + side + 1).min(posts[axis])
+    };
+    let scale = (1u64 << key.level) as f64;
+    let mut worst = 0.0f64;
+    for j in range(key.ty, 1) {
+        for i in range(key.tx, 0) {
+            let (x, y) = (i as f64 / scale, j as f64 / scale);
+            let corner = [x, y].map(|place| place.floor() as u64);
+            let at = |di: u64, dj: u64| {
+                let (i, j) = ((corner[0] + di).min(size[0] - 1), (corner[1] + dj).min(size[1] - 1));
+                f64::from(coarse[(j * size[0] + i) as usize])
+            };
+            let (u, v) = (x - corner[0] as f64, y - corner[1] as f64);
+            let low = at(0, 0) + (at(1, 0) - at(0, 0)) * u;
+            let high = at(0, 1) + (at(1, 1) - at(0, 1)) * u;
+            let apart = low + (high - low) * v - f64::from(fine[(j * posts[0] + i) as usize]);
+            worst = if apart.is_nan() { f64::INFINITY } else { worst.max(apart.abs()) };
+            if worst.is_infinite() {
+                return f32::INFINITY;
+            }
+        }
+    }
+    // Rounded up.
+    (worst * (1.0 + 1e-6)) as f32
 }
 
 impl Samples {

@@ -1,0 +1,192 @@
+#![allow(clippy::unwrap_used)]
+use super::*;
+use crate::meter::measure;
+use crate::oracle::{Dice, Land, bare, count, lands};
+use crate::tests_support::{Plan, mountains, store};
+use crate::{Pyramid, Unseen, depths};
+use glam::DVec3;
+use terrafarm_common::shading::Earth;
+
+const SIZE: (u32, u32) = (80, 60);
+const METHODS: [Method; 2] = [Method::Lod, Method::Column];
+
+/// Ground of several levels that are smooth enough to be used, and of many tiles.
+fn hills() -> Land {
+    let height = |i, j| mountains(i, j, 512, 300.0, 21) * 0.6;
+    let plan = Plan::heights([1000.0, -500.0], [9.0, 10.0], [1100, 900], height);
+    Land::new("hills", vec![plan])
+}
+
+fn single_layered() -> Vec<Land> {
+    let mut all = lands();
+    all.push(hills());
+    all.retain(|land| unfit(land.resident.index()).is_none());
+    assert!(all.len() > 8);
+    all
+}
+
+/// A camera above the ground somewhere in or beside a land, looking anywhere.
+fn camera(land: &Land, dice: &mut Dice) -> Camera {
+    let layer = &land.resident.index().layers[0];
+    let far = layer.far_corner();
+    let eye = [0, 1].map(|axis| {
+        let side = far[axis] - layer.origin[axis];
+        layer.origin[axis] + side * dice.between(-0.2, 1.2)
+    });
+    let above = [3.0, 40.0, 900.0][dice.below(3) as usize];
+    let position = DVec3::new(eye[0], eye[1], land.pyramid.highest() + above);
+    let pitch = [-90.0, -60.0, -30.0, dice.between(-20.0, 5.0)][dice.below(4) as usize];
+    let roll = [0.0, 0.0, 90.0, dice.between(-180.0, 180.0)][dice.below(4) as usize];
+    let fov = [30.0, 60.0, 140.0][dice.below(3) as usize];
+    let heading = [0.0, 90.0, dice.between(0.0, 360.0)][dice.below(3) as usize];
+    Camera::from_angles(position, heading, pitch, roll, fov, SIZE)
+}
+
+fn view(camera: Camera, dice: &mut Dice, method: quality::Method) -> View {
+    let earth = Earth { radius_m: 6_371_000.0, refraction: 0.13 };
+    let tolerance_px = [0.1, 0.25, 0.5, 1.0, 3.0][dice.below(5) as usize];
+    let quality = Quality { method, tolerance_px, ..Quality::default() };
+    View { camera, shading: bare((dice.below(2) == 0).then_some(earth)), quality }
+}
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+#[test]
+fn every_width_and_every_split_see_the_same_bits() {
+    for (number, land) in single_layered().iter().enumerate() {
+        let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+        let mut dice = Dice::new(40 + number as u64);
+        for _ in 0..count(6) {
+            let camera = camera(land, &mut dice);
+            let view = view(camera, &mut dice, quality::Method::Lod);
+            let whole = Region::whole(SIZE.0, SIZE.1);
+            for method in METHODS {
+                let see = |region, width| {
+                    let (seen, missing) = see(field, &view, region, method, width).unwrap();
+                    assert_eq!(missing, []);
+                    seen.inverse_depth
+                };
+                let scalar = see(whole, Width::One);
+                assert!(scalar.iter().all(|inverse| *inverse >= 0.0), "{} {method:?}", land.name);
+                for width in Width::available() {
+                    let same = bits(&see(whole, width)) == bits(&scalar);
+                    assert!(same, "{} {method:?} {width:?} {view:?}", land.name);
+                }
+                let (x, y) = (dice.below(70) as u32, dice.below(50) as u32);
+                let part = Region { x, y, width: 9, height: 8 };
+                for ([x, y], inverse) in part.pixels().zip(see(part, lanes::widest())) {
+                    let truth = scalar[(y * SIZE.0 + x) as usize];
+                    let said = format!("{} {method:?} {view:?} {x} {y}", land.name);
+                    assert_eq!(inverse.to_bits(), truth.to_bits(), "{said}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_seen_is_on_the_surface_to_the_tolerance() {
+    let (mut pixels, mut ground) = (0, 0);
+    for (number, land) in single_layered().iter().enumerate() {
+        let mut dice = Dice::new(80 + number as u64);
+        for round in 0..count(6) {
+            let method = [quality::Method::Lod, quality::Method::Column][(round % 2) as usize];
+            let camera = camera(land, &mut dice);
+            let view = view(camera, &mut dice, method);
+            let whole = Region::whole(SIZE.0, SIZE.1);
+            let seen = depths(&land.resident, &land.pyramid, &view, whole).unwrap();
+            for [x, y] in whole.pixels().step_by(7) {
+                let claimed = seen.distance_m(&view, x, y);
+                pixels += 1;
+                if claimed.is_infinite() || on_a_wall(land, &view, x, y) {
+                    continue;
+                }
+                ground += 1;
+                let (resident, pyramid) = (&land.resident, &land.pyramid);
+                let error = measure(resident, pyramid, &view, x, y, claimed).unwrap();
+                // Single precision adds a little of its own.
+                let allowed = view.quality.tolerance_px + 0.02;
+                let said = format!("{} {method} {view:?} {x} {y}: {error:?}", land.name);
+                assert!(error.surface_px <= allowed, "{said}");
+            }
+        }
+    }
+    assert!(ground > pixels / 4, "{ground} of {pixels} pixels see the ground");
+}
+
+/// Whether the exact ray meets a wall: the rim of a void or of the land, which is no
+/// height above any place.
+fn on_a_wall(land: &Land, view: &View, x: u32, y: u32) -> bool {
+    let quality = Quality { method: quality::Method::Exact, ..view.quality };
+    let exact = View { quality, ..view.clone() };
+    let hit = land.look(&exact, [f64::from(x) + 0.5, f64::from(y) + 0.5]);
+    hit.is_some_and(|hit| hit.height > hit.position.z + 1e-6)
+}
+
+#[test]
+fn missing_tiles_are_named_until_the_picture_is_whole() {
+    let height = |i, j| mountains(i, j, 512, 300.0, 21) * 0.6;
+    let plan = || Plan::heights([0.0; 2], [10.0; 2], [1100, 900], height);
+    let (empty, tiles) = store(vec![plan()]);
+    let full = Land::new("full", vec![plan()]);
+    let pyramid = Pyramid::new(empty.index());
+    for method in [quality::Method::Lod, quality::Method::Column] {
+        let eye = DVec3::new(2000.0, 300.0, full.pyramid.highest() + 100.0);
+        let camera = Camera::from_angles(eye, 20.0, -15.0, 0.0, 60.0, SIZE);
+        let view = view(camera, &mut Dice::new(3), method);
+        let whole = Region::whole(SIZE.0, SIZE.1);
+        let truth = depths(&full.resident, &full.pyramid, &view, whole).unwrap();
+        let mut resident = empty.clone();
+        let mut rounds = 0;
+        let seen = loop {
+            match depths(&resident, &pyramid, &view, whole) {
+                Ok(seen) => break seen,
+                Err(Unseen::Missing(keys)) => {
+                    assert!(!keys.is_empty() && keys.is_sorted());
+                    for (key, tile) in &tiles {
+                        if keys.contains(key) {
+                            resident.insert(*key, tile.clone());
+                        }
+                    }
+                }
+                Err(Unseen::Unfit(unfit)) => panic!("{unfit}"),
+            }
+            rounds += 1;
+            assert!(rounds < 20, "{method}");
+        };
+        assert_eq!(bits(&seen.inverse_depth), bits(&truth.inverse_depth), "{method}");
+        assert!(rounds > 0 && resident.loaded().count() < tiles.len());
+    }
+}
+
+#[test]
+fn insets_and_single_rows_are_refused_by_name_and_left_to_exact_by_auto() {
+    let flat = |_, _| 1.0;
+    let base = || Plan::heights([0.0; 2], [10.0; 2], [30, 30], flat);
+    let inset = Plan::heights([50.0; 2], [5.0; 2], [10, 10], flat);
+    let row = Plan::heights([0.0; 2], [10.0; 2], [30, 1], flat);
+    for land in [Land::new("inset", vec![base(), inset]), Land::new("row", vec![row])] {
+        let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+        let camera = Camera::from_angles(DVec3::splat(90.0), 0.0, -90.0, 0.0, 60.0, SIZE);
+        let mut view = view(camera, &mut Dice::new(1), quality::Method::Column);
+        let refused = Look::of(field, &view).unwrap_err();
+        assert_eq!(refused.instead, quality::Method::Exact);
+        assert!(refused.to_string().contains("column cannot do this"), "{refused}");
+        view.quality.method = quality::Method::Auto;
+        assert_eq!(Look::of(field, &view), Ok(Look::RayByRay(quality::Method::Exact)));
+    }
+    let land = Land::new("plain", vec![base()]);
+    let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+    let camera = Camera::from_angles(DVec3::splat(90.0), 0.0, -90.0, 0.0, 60.0, SIZE);
+    let mut view = view(camera, &mut Dice::new(1), quality::Method::Auto);
+    for (tolerance_px, look) in [
+        (0.01, Look::RayByRay(quality::Method::Exact)),
+        (0.05, Look::Fast(Method::Lod)),
+        (0.5, Look::Fast(Method::Column)),
+    ] {
+        view.quality.tolerance_px = tolerance_px;
+        assert_eq!(Look::of(field, &view), Ok(look));
+    }
+}
