@@ -20,6 +20,9 @@ const STRAIGHT_DOWN: f32 = 1e-6;
 
 /// Blocks of `1 << FIRST_BLOCK` cells are looked at first.
 const FIRST_BLOCK: i32 = 2;
+/// Depth at which a ray began, as a share of that at which it ended, from which on the two
+/// are the same but for rounding.
+const STARTED_BELOW: f32 = 1.0 - 1e-4;
 /// Share of a depth that single precision may add to it.
 const ROUNDING: f64 = 1e-5;
 
@@ -71,6 +74,28 @@ impl Kernel for Lod<'_, '_> {
 /// depths: 0 for the sky, NaN where a tile is missing. Returns the steps that it took.
 #[inline(always)]
 pub(crate) fn cast_pixels<L: Lanes>(
+    relief: &Relief,
+    camera: &Camera,
+    region: Region,
+    pixels: &[Alone],
+    inverse_depth: &mut [f32],
+) -> u64 {
+    let mut again = Vec::new();
+    let mut steps = cast_from::<L>(relief, camera, region, pixels, inverse_depth);
+    for &Alone { at, free } in pixels {
+        // Ground where the ray began: it may have begun below.
+        if free > 0.0 && inverse_depth[at as usize] * free > STARTED_BELOW {
+            again.push(Alone { at, free: 0.0 });
+        }
+    }
+    if !again.is_empty() {
+        steps += cast_from::<L>(relief, camera, region, &again, inverse_depth);
+    }
+    steps
+}
+
+#[inline(always)]
+fn cast_from<L: Lanes>(
     relief: &Relief,
     camera: &Camera,
     region: Region,
