@@ -179,9 +179,6 @@ fn mean<L: Lanes>(
         let number = sheet.number::<L>(tx, ty);
         let mut here = left & number.eq(L::I::splat(known));
         if !here.any() {
-            if !left.any() {
-                return;
-            }
             known = first::<L>(number, left);
             here = left & number.eq(L::I::splat(known));
             tile = match sheets.tile(level, known, wanted) {
@@ -218,5 +215,8 @@ fn mean<L: Lanes>(
         }
         texel = L::I::select(here, texel + L::I::splat(1), texel);
         left = left & (!here | texel.to_floats().lt(stop));
+        if !left.any() {
+            return;
+        }
     }
 }
