@@ -36,7 +36,8 @@ fn main() {
     let without = land(false);
     for camera in CAMERAS {
         let whole = view(camera);
-        let dark = View { shading: Shading { sun: None, ..whole.shading.clone() }, ..whole.clone() };
+        let dark =
+            View { shading: Shading { sun: None, ..whole.shading.clone() }, ..whole.clone() };
         let clear =
             View { shading: Shading { haze: None, ..whole.shading.clone() }, ..whole.clone() };
         let distances = distances(&with_photo, &whole);
@@ -130,8 +131,7 @@ fn time(runs: usize, land: &Land, view: &View, distances: &[f32]) -> f64 {
         let mut best = f64::INFINITY;
         for _ in 0..runs.max(1) {
             let start = Instant::now();
-            let missing =
-                shade(&land.resident, &land.pyramid, view, band, distances, &mut pixels);
+            let missing = shade(&land.resident, &land.pyramid, view, band, distances, &mut pixels);
             best = best.min(start.elapsed().as_secs_f64());
             assert!(missing.is_empty());
         }

@@ -274,18 +274,29 @@ unsafe fn gather_eights<const SIZE: usize>(table: *const u8, at: I, last: i32, m
     }
 }
 
+/// A place, read from memory: taking it out of a vector costs more.
+#[inline(always)]
+fn place(places: &[u32; 16], n: usize) -> usize {
+    // SAFETY: a reference may be read from.
+    unsafe { std::ptr::from_ref(&places[n]).read_volatile() as usize }
+}
+
 /// Eight bytes each from four places of a table, from the `n`th on.
 ///
 /// # Safety
 /// As above: eight bytes at each place must be readable.
 #[inline(always)]
-unsafe fn four_eights<const SIZE: usize>(table: *const u8, places: &[u32; 16], n: usize) -> __m256i {
+unsafe fn four_eights<const SIZE: usize>(
+    table: *const u8,
+    places: &[u32; 16],
+    n: usize,
+) -> __m256i {
     // SAFETY: by this function's own condition.
     unsafe {
-        let a = table.add(places[n] as usize * SIZE).cast::<i64>().read_unaligned();
-        let b = table.add(places[n + 1] as usize * SIZE).cast::<i64>().read_unaligned();
-        let c = table.add(places[n + 2] as usize * SIZE).cast::<i64>().read_unaligned();
-        let d = table.add(places[n + 3] as usize * SIZE).cast::<i64>().read_unaligned();
+        let a = table.add(place(places, n) * SIZE).cast::<i64>().read_unaligned();
+        let b = table.add(place(places, n + 1) * SIZE).cast::<i64>().read_unaligned();
+        let c = table.add(place(places, n + 2) * SIZE).cast::<i64>().read_unaligned();
+        let d = table.add(place(places, n + 3) * SIZE).cast::<i64>().read_unaligned();
         let low = _mm_unpacklo_epi64(_mm_cvtsi64_si128(a), _mm_cvtsi64_si128(b));
         let high = _mm_unpacklo_epi64(_mm_cvtsi64_si128(c), _mm_cvtsi64_si128(d));
         _mm256_inserti128_si256::<1>(_mm256_castsi128_si256(low), high)

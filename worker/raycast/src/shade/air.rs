@@ -89,8 +89,9 @@ impl Air {
             let x = rise.abs();
             let fall = exp::<L>(-x);
             let long = (one - fall).div(x);
-            let series = one - x * (L::F::splat(0.5)
-                - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
+            let series = one
+                - x * (L::F::splat(0.5)
+                    - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
             let mean = L::F::select(x.lt(L::F::splat(FLAT_WAY)), series, long);
             depth = depth * L::F::select(rise.lt(zero), mean.div(fall), mean);
         }

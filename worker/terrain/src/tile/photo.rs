@@ -24,9 +24,8 @@ pub const PHOTO_TILE_BYTES: usize =
     size_of::<PhotoTile>() + (size_of::<u32>() + size_of::<u16>()) * (2 * TURNED + 1);
 
 /// The texels of opaque sRGB colours, by channel and code.
-static OPAQUE: LazyLock<[[u32; 256]; 3]> = LazyLock::new(|| {
-    [0, 1, 2].map(|c| std::array::from_fn(|code| root(LINEAR_OF_SRGB[code], c)))
-});
+static OPAQUE: LazyLock<[[u32; 256]; 3]> =
+    LazyLock::new(|| [0, 1, 2].map(|c| std::array::from_fn(|code| root(LINEAR_OF_SRGB[code], c))));
 
 /// Colours of one tile of a photo, ready to be filtered.
 ///
