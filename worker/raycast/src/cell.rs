@@ -45,12 +45,6 @@ impl Corners {
         (sw - se) + (ne - nw)
     }
 
-    /// Slopes along x and y at a place within the cell, metres per cell.
-    pub(crate) fn slopes(&self, x: f64, y: f64) -> [f64; 2] {
-        let [sw, se, nw, ne] = self.heights;
-        [lerp(se - sw, ne - nw, y), lerp(nw - sw, ne - se, x)]
-    }
-
     /// Height on the line that the ray crosses at `u`. `axis` is the axis that the line
     /// cuts, `far` whether it is the eastern or northern side of cell `cell`.
     #[inline(always)]

@@ -121,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_slanted_view_stretches_along_the_view_whatever_the_roll() {
-        let (sin, cos) = (0.1f32, 0.994_987_43f32);
+        let (sin, cos) = (0.1f32, 0.994_987_4f32);
         for (heading, x) in [(0.0f64, true), (0.5, true), (1.2, false), (2.0, false), (3.0, true)] {
             let (hs, hc) = (libm::sin(heading) as f32, libm::cos(heading) as f32);
             let view = [cos * hc, cos * hs, -sin];

@@ -20,6 +20,9 @@ use terrafarm_terrain::tile::{FIELDS, PhotoTile, TURNED, Texels};
 
 /// The longest footprint, in its widths; longer ones take a coarser level.
 const MAX_STRETCH: f32 = 16.0;
+/// The most texels of a row. Only in the coarsest level, where a pixel covers much of the
+/// photo, are there more; those at the ends are left out.
+const LONGEST: f32 = 64.0;
 /// Coverage from which on a photo hides what lies below it.
 const OPAQUE: f32 = 0.999;
 /// How far beyond the centres of its outermost texels a photo reaches, in texels.
@@ -124,8 +127,7 @@ impl<L: Lanes> Row<L> {
             cell: [L::I::select(along_x, i, j), L::I::select(along_x, j, i)],
             part: [L::F::select(along_x, x, y), L::F::select(along_x, y, x)],
             slant: strip.slant,
-            // Not more than the stretch allows, also where that is no number.
-            length: length.min(L::F::splat(4.0 * MAX_STRETCH)),
+            length: length.min(L::F::splat(LONGEST)),
         }
     }
 }

@@ -249,10 +249,10 @@ impl Slow<'_> {
 
     fn slopes(&self, place: DVec2, size: f64) -> DVec2 {
         let layers = &self.resident.index().layers;
-        let heights = layers.iter().enumerate().filter(|(_, l)| l.kind == LayerKind::Height);
+        let mut heights =
+            layers.iter().enumerate().filter(|(_, l)| l.kind == LayerKind::Height).rev();
         let (number, layer) = heights
-            .filter(|(number, layer)| *number == 0 || inside(layer, place, 0.01))
-            .last()
+            .find(|(number, layer)| *number == 0 || inside(layer, place, 0.01))
             .expect("there is a layer");
         let spacing = layer.spacing[0].max(layer.spacing[1]);
         mixed(size / spacing, layer, |level| {
@@ -302,14 +302,15 @@ impl Slow<'_> {
         mixed((area / major).max(major / 16.0), layer, |level| {
             let [p, q] = posts(layer, place, level);
             let (middle, across) = if along_x { (p, q) } else { (q, p) };
-            let length = (length / f64::from(1u32 << level)).max(1.0);
+            let length = (length / f64::from(1u32 << level)).clamp(1.0, 64.0);
             let (start, stop) = (middle - 0.5 * length, middle + 0.5 * length);
             let mut sum = [0.0; 4];
             for texel in (start + 0.5).floor() as i64..(stop + 0.5).ceil() as i64 {
                 let at = texel as f64;
                 let weight = (stop - at + 0.5).min(at + 0.5 - start).min(1.0) / length;
                 let side = across + (at - middle) * slant;
-                for (beside, share) in [(0.0, 1.0 - side.fract()), (1.0, side.fract())] {
+                let part = side - side.floor();
+                for (beside, share) in [(0.0, 1.0 - part), (1.0, part)] {
                     let other = (side.floor() + beside) as i64;
                     let (i, j) = if along_x { (texel, other) } else { (other, texel) };
                     let color = self.texel(number, level, i, j);
@@ -379,11 +380,8 @@ fn mixed<const N: usize>(size: f64, layer: &Layer, at: impl Fn(usize) -> [f64; N
     std::array::from_fn(|n| fine[n] + (coarse[n] - fine[n]) * share)
 }
 
-/// The most that light may be off, but for one place in a thousand; a byte is 1/255.
-const TOLERANCE: f64 = 1e-3;
-/// The most that it may be off there: where a footprint is as long along x as along y,
-/// rounding decides along which of them its texels are averaged.
-const UNDECIDED: f64 = 5e-3;
+/// The most that light may be off; a byte is 1/255.
+const TOLERANCE: f64 = 2e-4;
 
 #[test]
 fn light_is_that_of_the_same_formulas_in_f64() {
@@ -395,18 +393,17 @@ fn light_is_that_of_the_same_formulas_in_f64() {
         let mut shader = Shader::new(field, &view.camera, &view.shading, 1);
         let light = shaded(&mut shader, &distances);
         let slow = Slow { resident: &resident, view: &view, lowest: pyramid.lowest() };
-        let (mut worst, mut compared, mut undecided) = (0.0f64, 0, 0);
+        let (mut worst, mut compared) = (0.0f64, 0);
         for (n, &s) in distances.iter().enumerate().filter(|(_, s)| s.is_finite()) {
             let (x, y) = (n as u32 % SIZE.0, n as u32 / SIZE.0);
             let expected = slow.light(f64::from(x) + 0.5, f64::from(y) + 0.5, f64::from(s));
             let off = |c: usize| (f64::from(light[c][n]) - expected[c]).abs();
             let off = off(0).max(off(1)).max(off(2));
-            assert!(off < UNDECIDED, "{x} {y}: off by {off} from {expected:?}");
-            undecided += u32::from(off > TOLERANCE);
+            assert!(off < TOLERANCE, "{x} {y}: off by {off} from {expected:?}");
             worst = worst.max(off);
             compared += 1;
         }
-        println!("{compared} places, off by at most {worst:.1e}; {undecided} undecided");
-        assert!(compared > 2000 && undecided * 1000 < compared);
+        println!("{compared} places, off by at most {worst:.1e}");
+        assert!(compared > 2000);
     }
 }
