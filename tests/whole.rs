@@ -22,6 +22,10 @@ mod bad_input;
 #[path = "whole/commands.rs"]
 mod commands;
 
+/// Short runs of every bench: what is reported, and that nothing is wrong.
+#[path = "whole/bench.rs"]
+mod bench;
+
 /// Two pictures and how far they are apart, against other programs.
 #[path = "whole/compare.rs"]
 mod compare;

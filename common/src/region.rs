@@ -21,6 +21,12 @@ impl Region {
         Region { x: 0, y: 0, width, height }
     }
 
+    /// Its pixels, column and row, row by row from the top left.
+    pub fn pixels(self) -> impl Iterator<Item = [u32; 2]> {
+        let columns = move |y: u32| (self.x..self.x + self.width).map(move |x| [x, y]);
+        (self.y..self.y + self.height).flat_map(columns)
+    }
+
     /// Number of pixels.
     pub fn area(&self) -> u64 {
         u64::from(self.width) * u64::from(self.height)

@@ -5,7 +5,7 @@ use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use terrafarm_common::accuracy::Share;
-use terrafarm_common::quality::Method;
+use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
 
 /// Flies a camera over real terrain, rendered by every PC in the office.
@@ -40,6 +40,9 @@ pub enum Command {
     Compare(Compare),
     /// Run the real scheduler on a virtual clock, with workers that fail
     Simulate(Simulate),
+    /// Measure speed, accuracy and stability of the methods; exit code 1 if one is wrong
+    #[command(subcommand)]
+    Bench(Bench),
 }
 
 /// `terrafarm demo`
@@ -352,6 +355,83 @@ pub struct Simulate {
     /// Let workers die, fall silent, come back late and lose messages
     #[arg(long)]
     pub faults: bool,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// `terrafarm bench ...`
+#[derive(Debug, Subcommand)]
+pub enum Bench {
+    /// Speed of the methods on one core, every answer checked
+    Core(BenchCore),
+    /// Time against error: all methods and settings over procedural and real terrain
+    SpeedAccuracy(BenchSpeedAccuracy),
+    /// Situations in which methods are known to fail, by every method that may be asked
+    Stability(BenchStability),
+}
+
+/// `terrafarm bench core`
+#[derive(Debug, ClapArgs)]
+pub struct BenchCore {
+    /// Store to look at [default: noise of 2 km relief, made for the bench]
+    #[arg(long, value_name = "STORE")]
+    pub terrain: Option<PathBuf>,
+    /// Flight whose keyframes are the cameras, CSV [default: horizon, down30, down80, rolled45]
+    #[arg(long, value_name = "CSV")]
+    pub flight: Option<PathBuf>,
+    /// Size of the picture
+    #[arg(long, value_parser = parse_size, value_name = "WxH", default_value = "1920x1080")]
+    pub size: (u32, u32),
+    /// Posts along a side of the terrain that is made; several with commas
+    #[arg(long, value_delimiter = ',', default_value = "4097", conflicts_with = "terrain",
+        value_parser = clap::value_parser!(u32).range(65..=32_769))]
+    pub posts: Vec<u32>,
+    /// Methods, with commas
+    #[arg(long, value_delimiter = ',', default_value = "exact,lod,column,frustum,voxel",
+        value_parser = parse_method)]
+    pub methods: Vec<Method>,
+    /// Tolerance of the methods that have one, pixels
+    #[arg(long, value_name = "PX", value_parser = parse_tolerance,
+        default_value_t = Quality::DEFAULT_TOLERANCE_PX)]
+    pub tolerance: f64,
+    /// Timed runs of each case, of which the median counts
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// Take the Earth as flat, whatever the store says
+    #[arg(long)]
+    pub flat: bool,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// `terrafarm bench speed-accuracy`
+#[derive(Debug, ClapArgs)]
+pub struct BenchSpeedAccuracy {
+    /// Small pictures of small terrain, for a quick look
+    #[arg(long)]
+    pub short: bool,
+    /// Store to look at as well (may be given again)
+    #[arg(long = "terrain", value_name = "STORE")]
+    pub terrains: Vec<PathBuf>,
+    /// Write the points to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Write the chart as SVG
+    #[arg(long, value_name = "FILE")]
+    pub svg: Option<PathBuf>,
+    /// Write the chart as PNG
+    #[arg(long, value_name = "FILE")]
+    pub png: Option<PathBuf>,
+}
+
+/// `terrafarm bench stability`
+#[derive(Debug, ClapArgs)]
+pub struct BenchStability {
+    /// Small pictures and few rays, for every change
+    #[arg(long)]
+    pub short: bool,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

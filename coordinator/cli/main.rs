@@ -3,7 +3,8 @@
 //! `args` mirrors the command line; every other module carries out one command. Nothing
 //! here decides who renders what, and nothing here touches a pixel.
 //!
-//! Exit codes: 0 done, 1 finished with failed frames, 2 could not run.
+//! Exit codes: 0 done, 1 finished with failed frames or a bench that
+//! found a method wrong, 2 could not run.
 
 mod args;
 mod commands;
@@ -23,6 +24,8 @@ pub enum Outcome {
     Done,
     /// The command finished, but some frames failed.
     FailedFrames,
+    /// A bench ran to its end and found a promise broken.
+    BrokenPromise,
 }
 
 fn main() -> ExitCode {
@@ -38,7 +41,7 @@ fn main() -> ExitCode {
     log_to_stderr(args.verbose);
     match commands::run(args.command) {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
-        Ok(Outcome::FailedFrames) => ExitCode::from(1),
+        Ok(Outcome::FailedFrames | Outcome::BrokenPromise) => ExitCode::from(1),
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("terrafarm: {}", one_line(&error));

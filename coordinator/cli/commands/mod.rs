@@ -1,5 +1,6 @@
 //! One module a command.
 
+mod bench;
 mod compare;
 mod demo;
 mod render;
@@ -28,5 +29,6 @@ pub fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Worker(args) => serve::worker(args),
         Command::Compare(args) => compare::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Bench(args) => bench::run(&args),
     }
 }

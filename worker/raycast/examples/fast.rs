@@ -42,6 +42,9 @@ fn main() {
         ("rolled", DVec3::new(510240.0, 5010240.0, 3552.300049), 50.0, -30.0, 45.0),
     ];
     for (name, eye, heading, pitch, roll) in cameras {
+        if std::env::var("CAM").is_ok_and(|cam| cam != name) {
+            continue;
+        }
         let view = |method| View {
             camera: Camera::from_angles(eye, heading, pitch, roll, 60.0, (1920, 1080)),
             shading: Shading {
@@ -63,24 +66,23 @@ fn main() {
             for _ in 0..runs {
                 let (start, wall) = (cpu_s(), Instant::now());
                 answer = Some(depths(&resident, &pyramid, &view, frame).expect("loaded"));
-                times.push(cpu_s() - start);
-                let _ = wall;
+                let _ = start;
+                times.push(wall.elapsed().as_secs_f64());
             }
-            let time = times.iter().sum::<f64>() / times.len() as f64;
+            let time = times.iter().copied().fold(f64::INFINITY, f64::min);
             let answer = answer.expect("ran");
             let mut errors: Vec<f64> = Vec::new();
             let (mut sky, mut nan) = (0, 0);
-            for y in (3..1080).step_by(7) {
-                for x in (2..1920).step_by(5) {
-                    let at = y * 1920 + x;
-                    let (a, t) = (answer.distance_m[at], truth.distance_m[at]);
+            for y in (3..1080u32).step_by(7) {
+                for x in (2..1920u32).step_by(5) {
+                    let (a, t) = (answer.distance_m(&view, x, y) as f32, truth.distance_m(&view, x, y) as f32);
                     if a.is_nan() {
                         nan += 1;
                     } else if a.is_finite() != t.is_finite() {
                         sky += 1;
                         errors.push(99.0);
                     } else if a.is_finite() {
-                        let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5).normalize();
+                        let ray = view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5).normalize();
                         let p = eye + ray * f64::from(a);
                         let ground = height(&resident, p.x, p.y);
                         errors.push(((p.z - ground).abs() * view.camera.focal_px()) / f64::from(a));
@@ -96,7 +98,7 @@ fn main() {
                 time * 1e9 / (1920.0 * 1080.0),
                 answer.stats.steps as f64 / (1920.0 * 1080.0),
                 answer.stats.rays as f64 / (1920.0 * 1080.0),
-                answer.stats.hits as f64 / (1920.0 * 1080.0),
+                answer.stats.fallbacks as f64 / (1920.0 * 1080.0),
                 at(0.5),
                 at(0.99),
                 at(1.0),

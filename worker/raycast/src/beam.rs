@@ -57,6 +57,8 @@ pub(crate) struct Beams<'a> {
     layers: Vec<Grid>,
     tiles: Cursor<'a>,
     first_step: f64,
+    /// Room to be kept above the ground, metres for each metre away.
+    slack: f64,
     /// Intervals of depth looked at.
     pub steps: u64,
 }
@@ -86,25 +88,38 @@ struct Bounds {
     across_squared: f64,
     /// The depth to which the bounds hold.
     reach: f64,
+    /// Length of the longest ray at depth 1.
+    longest: f64,
     /// Width of the beam at depth 1.
     width: f64,
 }
 
 impl<'a> Beams<'a> {
     pub(crate) fn new(field: Field<'a>, camera: &'a Camera, ground: path::Ground) -> Self {
+        Beams::with_slack(field, camera, ground, 0.0)
+    }
+
+    /// Beams over ground that may be higher than level 0 by so much for each metre away.
+    pub(crate) fn with_slack(
+        field: Field<'a>,
+        camera: &'a Camera,
+        ground: path::Ground,
+        slack: f64,
+    ) -> Self {
         let eye = camera.position;
         let mut first_step = 0.0f64;
         let layers = field.index().layers_of(LayerKind::Height).map(|(number, layer)| {
             let scale = layer.spacing.map(|spacing| 1.0 / spacing);
             let cells = cells_of(layer);
             for (count, spacing) in cells.into_iter().zip(layer.spacing) {
-                first_step = first_step.max(f64::from(count) * spacing * FIRST_STEP);
+                // A step of 0 would never end: a single post counts as a cell.
+                first_step = first_step.max(f64::from(count.max(1)) * spacing * FIRST_STEP);
             }
             let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
             Grid { number, eye, scale, cells }
         });
         let layers = layers.collect();
-        Beams { field, camera, ground, layers, tiles: Cursor::new(field), first_step, steps: 0 }
+        Beams { field, camera, ground, layers, tiles: Cursor::new(field), first_step, slack, steps: 0 }
     }
 
     /// Calls `see` for each pixel of a square with the depth up to which every ray
@@ -172,6 +187,7 @@ impl<'a> Beams<'a> {
             } else {
                 FLAT_REACH_M / longest
             },
+            longest,
             width: f64::from(square.width.max(square.height)) / camera.focal_px(),
         }
     }
@@ -187,7 +203,7 @@ impl<'a> Beams<'a> {
             let end = (free + step).min(bounds.reach);
             let rise = (bounds.low.z * free).min(bounds.low.z * end);
             let z = eye_z + self.ground.rise(eye_z, bounds.across_squared * free * free, rise);
-            let lowest = z - CLEARANCE_M;
+            let lowest = z - CLEARANCE_M - self.slack * end * bounds.longest;
             if bounds.low.z >= 0.0 && lowest > self.field.pyramid.highest() {
                 return Front { free: f64::INFINITY, step };
             }

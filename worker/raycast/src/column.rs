@@ -1,45 +1,56 @@
 //! The `column` method: coherent rays along lines through the nadir.
 //!
 //! All rays in a vertical plane through the camera appear on one line of the picture, and
-//! all these lines pass through the point V straight below the camera (or straight above;
-//! where the camera looks level it is infinitely far). Along such a line each ray rises
-//! more steeply than the one before and begins where that one ended, whatever the pitch
-//! and the roll (after Cohen-Or et al., section 2, whose columns are those of a camera
-//! that does not roll).
+//! along such a line each ray rises more steeply than the one before and begins where that
+//! one ended, whatever the pitch and the roll (after Cohen-Or et al., section 2, whose
+//! columns are those of a camera that does not roll). `lattice` says which lines and rays
+//! there are: neighbours are about four pixels apart for each pixel of tolerance.
 //!
-//! A pixel is seen along rows or along columns of the picture, whichever its line crosses
-//! less slantingly. Take rows: a *band* of rows has lines a pixel apart at its row furthest
-//! from V, and closer than that elsewhere, by half at most; the next band begins there.
-//! Each line has one ray through each row. A pixel then lies between two neighbouring rays
-//! of its own row, and is seen where they see: in between if they see neighbouring
-//! ground, else where the nearer one does, which is at most half a pixel aside.
+//! What rays find is kept as inverse depth, which over a plane is linear in the picture. A
+//! pixel is first guessed between the four rays around it, if they see neighbouring ground,
+//! then compared with the surface at that very place: what is off by more than half the
+//! tolerance is corrected along the pixel's own ray and compared again. Where the rays see
+//! different ground, where the corrections do not settle, and close to V, the pixel has a
+//! ray of its own, that of `lod`. So every pixel shows a point of the surface, to the
+//! tolerance; what a pixel can miss is ground in front that is narrower than the distance
+//! between rays.
 
-use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask};
+use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask, as_bits};
+use crate::lattice::{Band, Fan, Frame};
+use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
-use crate::walk::{Lines, Rows, Walk, as_bits};
-use glam::{DVec2, DVec3};
+use crate::seen::Seen;
+use crate::walk::{Lines, Rows, Slopes, Walk};
+use glam::DVec2;
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
 
-/// Pixels closer to V than this are left to `lod`.
-const NEAREST_PX: f64 = 8.0;
-/// Two rays see neighbouring ground if their distances differ by less than this share.
-const NEIGHBOURS: f32 = 0.02;
-/// Distance between lines at the reference row of a band, pixels: per pixel of tolerance,
-/// least and most. Measured (`bench core`): the error's 99th percentile stays below the
-/// tolerance by a third.
-const SPACING: f64 = 4.0;
+/// Distance between lines, pixels for each pixel of tolerance, and the least and the most.
+/// Measured (`bench core`): more lines cost more, fewer leave more pixels to rays of their
+/// own.
+const SPACING: f64 = 5.0;
 const SPACINGS: [f64; 2] = [0.5, 4.0];
-/// A band ends where its lines are closer than this share of the spacing ...
-const CLOSEST: f64 = 0.55;
-/// ... so that N pixels lie between at most 2 N lines, unless there are more lines than
-/// this a pixel.
+/// Rays see neighbouring ground if their depths differ by no more than this share.
+const NEIGHBOURS: f32 = 0.02;
+/// How much closer than the nearest ground seen around a pixel its own ray begins to look:
+/// a ridge may come closer between the rays around it.
+const SHARE_FREE: f32 = 0.9;
+/// Share of the tolerance by which a pixel may be off the surface without being corrected.
+/// The other half is for the surface: see [`LEVELS`].
+const ALLOWED: f64 = 0.5;
+/// Share of the tolerance by which the levels of the surface may be off level 0.
+pub(crate) const LEVELS: f64 = 0.5;
+/// How often a pixel is compared with the surface at most ...
+const CORRECTIONS: usize = 4;
+/// ... and by what share of its depth it may be moved each time.
+const FARTHEST: f32 = 0.05;
+/// Lines a pixel up to which those between N pixels are no more than 2 N.
 const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
 const WIDEST_PX: u32 = 256;
 
-/// What the method needs to know of a view.
+/// The method for a region of a view.
 pub(crate) struct Columns<'r, 'a> {
     pub relief: &'r Relief<'a>,
     pub camera: &'r Camera,
@@ -47,156 +58,24 @@ pub(crate) struct Columns<'r, 'a> {
     pub region: Region,
 }
 
-/// Distances, pixel by pixel, and what they took.
-pub(crate) struct Seen {
-    /// Straight distances from the camera, metres; infinite for the sky, NaN where a tile
-    /// is missing and where the method does not apply.
-    pub distance: Vec<f32>,
-    pub steps: u64,
-    pub rays: u64,
-    pub fallen: u64,
-    /// Pixels that the method does not apply to.
-    pub left: u64,
+/// A row of pixels, and the lines around them.
+struct Span {
+    pixels: Range<u32>,
+    lines: Range<i32>,
 }
 
-/// The picture with rows as the major axis, or columns.
-struct Frame {
-    by_rows: bool,
-    /// Direction of the ray through the corner of the picture ...
-    corner: DVec3,
-    /// ... and how it changes from pixel to pixel along the minor and the major axis.
-    minor: DVec3,
-    major: DVec3,
-    /// V: along minor, along major, and what both are to be divided by.
-    v: [f64; 3],
-    /// Pixels along the minor and the major axis.
-    size: [u32; 2],
-}
-
-/// Rows whose lines are a pixel apart in the first of them.
-struct Band {
-    /// The row, at its middle.
-    reference: f64,
-    rows: Range<u32>,
-}
-
-/// The lines of a band: line K goes through K in the reference row and through
-/// `K + d (K q - r)` in the row d further on.
-struct Fan {
-    reference: f64,
-    q: f64,
-    r: f64,
-    spacing: f64,
-}
-
-impl Frame {
-    fn new(camera: &Camera, by_rows: bool) -> Self {
-        let scale = 1.0 / camera.focal_px();
-        let (across, down) = (camera.right * scale, -camera.up * scale);
-        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-        let corner = camera.forward - across * (0.5 * width) - down * (0.5 * height);
-        let w = -camera.forward.z;
-        let focal = camera.focal_px();
-        let x = 0.5 * width * w - focal * camera.right.z;
-        let y = 0.5 * height * w + focal * camera.up.z;
-        if by_rows {
-            let size = [camera.width, camera.height];
-            Frame { by_rows, corner, minor: across, major: down, v: [x, y, w], size }
-        } else {
-            let size = [camera.height, camera.width];
-            Frame { by_rows, corner, minor: down, major: across, v: [y, x, w], size }
-        }
-    }
-
-    /// How far a row is from V, with a sign for the side; in units of V's last part.
-    fn apart(&self, row: f64) -> f64 {
-        row * self.v[2] - self.v[1]
-    }
-
-    /// Whether a pixel is seen along this frame's rows rather than its columns.
-    fn owns(&self, minor: u32, major: u32) -> bool {
-        let across = ((f64::from(minor) + 0.5) * self.v[2] - self.v[0]).abs();
-        let along = self.apart(f64::from(major) + 0.5).abs();
-        // A tie goes to the rows of the picture.
-        if self.by_rows { along >= across } else { along > across }
-    }
-
-    /// The bands of the picture, each from its reference row towards V.
-    fn bands(&self) -> Vec<Band> {
-        let mut bands = Vec::new();
-        let last = self.size[1];
-        let middle = |row: u32| f64::from(row) + 0.5;
-        for positive in [false, true] {
-            // Rows on this side of V that are not too close to it.
-            let near = NEAREST_PX * self.v[2].abs();
-            let on_side = |row: u32| {
-                let apart = self.apart(middle(row));
-                if positive { apart > near } else { apart < -near }
-            };
-            let (first, end) = match ((0..last).find(|&row| on_side(row)), (0..last).rfind(|&row| on_side(row))) {
-                (Some(first), Some(end)) => (first, end + 1),
-                _ => continue,
-            };
-            let mut rest = first..end;
-            while !rest.is_empty() {
-                let (low, high) =
-                    (self.apart(middle(rest.start)).abs(), self.apart(middle(rest.end - 1)).abs());
-                let half = CLOSEST * low.max(high);
-                let far_first = low >= high;
-                let inside = |row: &u32| self.apart(middle(*row)).abs() >= half;
-                if far_first {
-                    let cut = rest.clone().take_while(inside).last().map_or(rest.start, |row| row) + 1;
-                    bands.push(Band { reference: middle(rest.start), rows: rest.start..cut });
-                    rest.start = cut;
-                } else {
-                    let cut = rest.clone().rev().take_while(inside).last().map_or(rest.end - 1, |row| row);
-                    bands.push(Band { reference: middle(rest.end - 1), rows: cut..rest.end });
-                    rest.end = cut;
-                }
-            }
-        }
-        bands
-    }
-
-    fn fan(&self, band: &Band, spacing: f64) -> Fan {
-        let scale = 1.0 / self.apart(band.reference);
-        Fan { reference: band.reference, q: self.v[2] * scale, r: self.v[0] * scale, spacing }
-    }
-
-    /// The pixels of a row, of those from `minors`, that are seen along this frame's rows:
-    /// those no further from V across than along.
-    fn owned(&self, row: u32, minors: Range<u32>) -> Range<u32> {
-        let none = minors.start..minors.start;
-        if minors.is_empty() {
-            return none;
-        }
-        let owns = |minor: u32| self.owns(minor, row);
-        if owns(minors.start) && owns(minors.end - 1) {
-            return minors;
-        }
-        let reach = self.apart(f64::from(row) + 0.5).abs();
-        let (a, b) = ((self.v[0] - reach) / self.v[2], (self.v[0] + reach) / self.v[2]);
-        let pixel = |place: f64| (place - 0.5).clamp(-1.0, f64::from(u32::MAX)) as u32;
-        let (mut first, mut last) = (pixel(a.min(b)), pixel(a.max(b)) + 1);
-        first = first.saturating_sub(1).clamp(minors.start, minors.end - 1);
-        last = (last + 1).clamp(minors.start, minors.end - 1);
-        // What is left of rounding.
-        while first < last && !owns(first) {
-            first += 1;
-        }
-        while last > first && !owns(last) {
-            last -= 1;
-        }
-        if owns(first) { first..last + 1 } else { none }
-    }
-}
-
-impl Fan {
-    /// The line through a point of a row.
-    fn line(&self, minor: f64, row: f64) -> f64 {
-        let d = row - self.reference;
-        (minor + d * self.r) / (1.0 + d * self.q) / self.spacing
-    }
+/// The rays of a part of a band, ray by ray from `first_ray`, in each line by line from
+/// `first_line`.
+struct Net {
+    answers: Vec<f32>,
+    /// By the first of the four answers around a cell of the net: 1 if here or in one of
+    /// the eight cells around the four are not of neighbouring ground, else 0.
+    breaks: Vec<f32>,
+    /// The same without the cells around.
+    own_breaks: Vec<f32>,
+    width: usize,
+    first_ray: usize,
+    first_line: i32,
 }
 
 impl Kernel for Columns<'_, '_> {
@@ -205,21 +84,94 @@ impl Kernel for Columns<'_, '_> {
     #[inline(always)]
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
-        let mut seen = Seen { distance: vec![f32::NAN; area], steps: 0, rays: 0, fallen: 0, left: area as u64 };
-        let mut rays = Vec::new();
+        let mut seen = Seen::new(self.region);
+        let mut net = Net {
+            answers: Vec::new(),
+            breaks: Vec::new(),
+            own_breaks: Vec::new(),
+            width: 0, first_ray: 0,
+            first_line: 0,
+        };
+        let mut alone = Vec::new();
+        let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
+        let mut done = 0;
         for by_rows in [true, false] {
             let frame = Frame::new(self.camera, by_rows);
             for band in frame.bands() {
+                let fan = frame.fan(&band, spacing);
                 for part in parts(self.region, by_rows) {
-                    self.band::<L>(&frame, &band, part, &mut rays, &mut seen);
+                    let spans = spans(&frame, &band, &fan, &part);
+                    if !spans.iter().all(|span| span.pixels.is_empty()) {
+                        let first = band.rows.start.max(part[1].start);
+                        self.cast::<L>(&frame, &fan, first, &spans, &mut net, &mut seen);
+                        let filled = spans.iter().zip(first..);
+                        for (span, row) in filled.filter(|(span, _)| !span.pixels.is_empty()) {
+                            done += span.pixels.len() as u64;
+                            let rows = (row, span.pixels.clone());
+                            self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut alone);
+                        }
+                    }
                 }
             }
         }
+        if done < area as u64 {
+            // What is close to V.
+            let frames = [true, false].map(|by_rows| Frame::new(self.camera, by_rows));
+            let [columns, rows] = frames[0].around_v().unwrap_or([0..0, 0..0]);
+            for (at, [x, y]) in (0..).zip(self.region.pixels()) {
+                if !columns.contains(&x) || !rows.contains(&y) {
+                    continue;
+                }
+                let near = frames[0].owns(x, y) && frames[0].is_near(y)
+                    || frames[1].owns(y, x) && frames[1].is_near(x);
+                if near {
+                    alone.push(Alone { at, free: 0.0 });
+                }
+            }
+        }
+        seen.alone = alone.len() as u64;
+        seen.rays += seen.alone;
+        seen.steps +=
+            cast_pixels::<L>(self.relief, self.camera, self.region, &alone, &mut seen.inverse_depth);
         seen
     }
 }
 
-/// A region in parts that are not too wide along the minor axis.
+impl Net {
+    /// Finds the cells where the picture breaks, and their neighbours.
+    #[inline(always)]
+    fn compare<L: Lanes>(&mut self) {
+        let Net { answers, breaks, own_breaks, width, .. } = self;
+        let (width, count) = (*width, answers.len());
+        // A margin for the vectors beyond the end.
+        answers.resize(count + width + 2 * MOST, 0.0);
+        for list in [&mut *breaks, &mut *own_breaks] {
+            list.clear();
+            list.resize(count + width + 2 * MOST, 0.0);
+        }
+        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
+        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
+        for at in (0..count).step_by(L::N) {
+            let (a, b) = (L::F::load(&answers[at..]), L::F::load(&answers[at + 1..]));
+            let next = if at + width < count { at + width } else { at };
+            let (c, e) = (L::F::load(&answers[next..]), L::F::load(&answers[next + 1..]));
+            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
+            let same = (high * neighbours).le(low);
+            L::F::select(same, zero, one).store(&mut own_breaks[at..]);
+        }
+        for at in (1..count).step_by(L::N) {
+            let mut worst = zero;
+            for row in [at.saturating_sub(width).max(1), at, at + width] {
+                for place in [row - 1, row, row + 1] {
+                    worst = worst.max(L::F::load(&own_breaks[place..]));
+                }
+            }
+            worst.store(&mut breaks[at..]);
+        }
+    }
+}
+
+/// A region in parts that are not too wide along the minor axis: minors and majors.
 fn parts(region: Region, by_rows: bool) -> impl Iterator<Item = [Range<u32>; 2]> {
     let columns = region.x..region.x + region.width;
     let rows = region.y..region.y + region.height;
@@ -229,78 +181,73 @@ fn parts(region: Region, by_rows: bool) -> impl Iterator<Item = [Range<u32>; 2]>
     })
 }
 
+/// For each row of a band within a part its pixels, and the lines that they lie between.
+fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 2]) -> Vec<Span> {
+    let rows = band.rows.start.max(majors.start)..band.rows.end.min(majors.end);
+    let span = |row: u32| {
+        let pixels = frame.owned(row, minors.clone());
+        if pixels.is_empty() {
+            return Span { pixels, lines: 0..0 };
+        }
+        let middle = f64::from(row) + 0.5;
+        let line = |pixel: u32| fan.line(f64::from(pixel) + 0.5, middle);
+        let (a, b) = (line(pixels.start), line(pixels.end - 1));
+        // One more on each side to compare with, and one makes up for rounding.
+        let lines = a.min(b).floor() as i32 - 2..a.max(b).floor() as i32 + 4;
+        Span { pixels, lines }
+    };
+    rows.map(span).collect()
+}
+
 impl Columns<'_, '_> {
+    /// Casts the rays that the pixels of some rows lie between.
     #[inline(always)]
-    fn band<L: Lanes>(
+    fn cast<L: Lanes>(
         &self,
         frame: &Frame,
-        band: &Band,
-        [minors, majors]: [Range<u32>; 2],
-        rays: &mut Vec<f32>,
+        fan: &Fan,
+        first_row: u32,
+        spans: &[Span],
+        net: &mut Net,
         seen: &mut Seen,
     ) {
-        let rows = band.rows.start.max(majors.start)..band.rows.end.min(majors.end);
-        let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
-        let fan = frame.fan(band, spacing);
-        // For each row its pixels, and the lines that they lie between.
-        let mut spans = Vec::new();
-        let (mut first, mut last) = (i32::MAX, i32::MIN);
-        for row in rows.clone() {
-            let pixels = frame.owned(row, minors.clone());
-            if pixels.is_empty() {
-                spans.push((pixels, 0, -1));
-                continue;
-            }
-            let middle = f64::from(row) + 0.5;
-            let line = |pixel: u32| fan.line(f64::from(pixel) + 0.5, middle);
-            let (a, b) = (line(pixels.start), line(pixels.end - 1));
-            // Line k goes through k + 1/2. One more on each side makes up for rounding.
-            let low = (a.min(b) - 0.5).floor() as i32 - 1;
-            let high = (a.max(b) - 0.5).floor() as i32 + 2;
-            (first, last) = (first.min(low), last.max(high));
-            spans.push((pixels, low, high));
-        }
-        if first > last {
-            return;
-        }
+        let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
+        let rays = |row: u32| {
+            let (before, rest) = fan.rays(row);
+            // And one more on each side to compare with.
+            before.saturating_sub(1)..before + 2 + usize::from(rest > 0.0)
+        };
+        let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
+        let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
+        let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
+        let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
         // Whole vectors are looked at, and twice as much.
-        let width = (last - first + 1) as usize + 2 * MOST;
-        rays.clear();
-        rays.resize(width * spans.len(), 0.0);
-        let mut block = first;
-        while block <= last {
-            let end = block + L::N as i32 - 1;
-            let meets = |span: &(Range<u32>, i32, i32)| span.1 <= end && span.2 >= block;
-            if let (Some(low), Some(high)) =
-                (spans.iter().position(meets), spans.iter().rposition(meets))
-            {
-                let at = (block - first) as usize;
-                let rows = (rows.start + low as u32)..(rows.start + high as u32 + 1);
-                let rays = &mut rays[low * width..(high + 1) * width];
-                seen.rays += rows.len() as u64 * L::N as u64;
-                seen.steps += self.block::<L>(frame, &fan, block, rows, rays, width, at);
+        let width = (end_line - first_line) as usize + 2 * MOST;
+        net.answers.clear();
+        net.answers.resize(width * (end_ray - first_ray), 0.0);
+        (net.width, net.first_ray, net.first_line) = (width, first_ray, first_line);
+        for block in (first_line..end_line).step_by(L::N) {
+            let end = block + L::N as i32;
+            let meets = |(span, _): &(&Span, u32)| span.lines.start < end && span.lines.end > block;
+            let low = filled().filter(meets).map(|(_, row)| rays(row).start).min();
+            let high = filled().filter(meets).map(|(_, row)| rays(row).end).max();
+            if let (Some(low), Some(high)) = (low, high) {
+                seen.rays += ((high - low) * L::N) as u64;
+                seen.steps += self.block::<L>(frame, fan, block, low..high, net);
             }
-            block += L::N as i32;
         }
-        for (at, (pixels, _, _)) in spans.iter().enumerate() {
-            let row = rows.start + at as u32;
-            let rays = &rays[at * width..(at + 1) * width];
-            self.resample::<L>(frame, &fan, row, pixels.clone(), rays, first, seen);
-        }
+        net.compare::<L>();
     }
 
-    /// Casts the rays of N lines through some rows. Returns the steps that it took.
+    /// Casts rays of N lines. Returns the steps that it took.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
     fn block<L: Lanes>(
         &self,
         frame: &Frame,
         fan: &Fan,
         first: i32,
-        rows: Range<u32>,
-        rays: &mut [f32],
-        width: usize,
-        at: usize,
+        rays: Range<usize>,
+        net: &mut Net,
     ) -> u64 {
         let mut values = [[0.0f32; MOST]; 6];
         for lane in 0..L::N {
@@ -310,132 +257,216 @@ impl Columns<'_, '_> {
             let across = DVec2::new(start.x, start.y);
             let length = across.length();
             let along = across / length;
-            let parts = [
-                along.x,
-                along.y,
-                length,
-                change.x * along.x + change.y * along.y,
-                start.z,
-                change.z,
-            ];
+            let longer = change.x * along.x + change.y * along.y;
+            let parts = [along.x, along.y, length, longer, start.z, change.z];
             for (value, part) in values.iter_mut().zip(parts) {
                 value[lane] = part as f32;
             }
         }
-        let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
-        let (length, longer) = (L::F::load(&values[2]), L::F::load(&values[3]));
-        let (rise, higher) = (L::F::load(&values[4]), L::F::load(&values[5]));
-        // Rows in the order of rising rays.
-        let d = |row: u32| (f64::from(row) + 0.5 - fan.reference) as f32;
-        let tangent = |row: u32| {
+        // Rays in the order in which they rise.
+        let d = |ray: usize| (ray as f64 * fan.every) as f32;
+        let tangent = |ray: usize| {
             let [_, _, length, longer, rise, higher] = values.map(|value| value[0]);
-            (rise + d(row) * higher) / (length + d(row) * longer)
+            (rise + d(ray) * higher) / (length + d(ray) * longer)
         };
-        let upwards = tangent(rows.start) <= tangent(rows.end - 1);
-        let mut lane = [0; MOST];
-        let last = (rows.len() - 1) * width;
-        for (number, place) in lane.iter_mut().enumerate() {
-            *place = (at + number + if upwards { 0 } else { last }) as i32;
+        let (low, high) = (rays.start, rays.end - 1);
+        let onwards = tangent(low) <= tangent(high);
+        let (begin, step) = if onwards { (low, 1) } else { (high, -1) };
+        let at = (begin - net.first_ray) * net.width + (first - net.first_line) as usize;
+        let mut places = [0; MOST];
+        for (place, lane) in places.iter_mut().zip(0..) {
+            *place = at as i32 + lane;
         }
+        let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
         let rows = Rows {
-            rise,
-            higher,
-            length,
-            longer,
-            first: if upwards { d(rows.start) } else { d(rows.end - 1) },
-            step: if upwards { 1.0 } else { -1.0 },
-            count: rows.len() as i32,
-            at: L::I::load(&lane),
-            pitch: if upwards { width as i32 } else { -(width as i32) },
+            length: L::F::load(&values[2]),
+            longer: L::F::load(&values[3]),
+            rise: L::F::load(&values[4]),
+            higher: L::F::load(&values[5]),
+            first: d(begin),
+            step: fan.every as f32 * step as f32,
+            count: rays.len() as i32,
+            at: L::I::load(&places),
+            pitch: net.width as i32 * step,
         };
         let lines = Lines::<L>::new(self.relief, [x, y]);
-        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0));
-        walk.run(rays);
-        walk.steps
+        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0), 8);
+        walk.run(&mut net.answers);
+        walk.looked
     }
 
-    /// Sees the pixels of a row between the rays of its lines.
+    /// Sees the pixels of a row between the rays around them. Those that cannot be seen so
+    /// are added to `alone`, by their place in the region.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
-    fn resample<L: Lanes>(
+    fn see<L: Lanes>(
         &self,
         frame: &Frame,
         fan: &Fan,
-        row: u32,
-        pixels: Range<u32>,
-        rays: &[f32],
-        first: i32,
+        (row, pixels): (u32, Range<u32>),
+        net: &Net,
         seen: &mut Seen,
+        alone: &mut Vec<Alone>,
     ) {
-        let middle = f64::from(row) + 0.5;
-        let d = middle - fan.reference;
+        let d = f64::from(row) + 0.5 - fan.reference;
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
-        // Line k goes through k + 1/2.
-        let start = (d * fan.r * scale - 0.5) as f32;
-        let begin = frame.corner + frame.major * middle;
-        let mut numbers = [0.0f32; MOST];
-        for (lane, number) in numbers.iter_mut().enumerate() {
-            *number = lane as f32;
-        }
-        let numbers = L::F::load(&numbers);
-        // The same bits, for gathers.
-        let table = as_bits(rays);
-        let mut out = [0.0f32; MOST];
+        let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
+        let scale_f = L::F::splat(scale as f32);
+        let begin = frame.corner + frame.major * (f64::from(row) + 0.5);
+        let (ray, down) = fan.rays(row);
+        let at = (ray - net.first_ray) * net.width;
+        let before = &net.answers[at..at + net.width];
+        let next = if down > 0.0 { at + net.width } else { at };
+        let after = &net.answers[next..next + net.width];
+        let breaks = &net.breaks[at..at + net.width];
+        let down = L::F::splat(down);
+        let numbers = L::F::load(&NUMBERS);
+        let sparse = scale < DENSEST;
+        let region = self.region;
         let mut places = [0; MOST];
-        let sparse = scale.abs() < DENSEST;
-        let mut pixel = pixels.start;
-        while pixel < pixels.end {
+        let mut out = [0.0f32; MOST];
+        let mut nearest = [0.0f32; MOST];
+        for pixel in pixels.clone().step_by(L::N) {
             let minor = numbers + L::F::splat(pixel as f32 + 0.5);
-            let line = L::F::splat(start) + minor * L::F::splat(scale as f32);
+            let line = start + minor * scale_f;
             let left = line.floor();
             let share = line - left.to_floats();
-            let left = left - L::I::splat(first);
-            let (a, b) = if sparse {
+            let left = left - L::I::splat(net.first_line);
+            let ((a, b), (c, e), broken) = if sparse {
                 left.store(&mut places);
                 let base = places[0].max(0) as usize;
                 let left = left - L::I::splat(base as i32);
-                (L::F::lookup(&rays[base..], left), L::F::lookup(&rays[base + 1..], left))
+                (
+                    looked_up::<L>(&before[base..], left),
+                    looked_up::<L>(&after[base..], left),
+                    L::F::lookup(&breaks[base..], left),
+                )
             } else {
-                (gathered::<L>(table, left), gathered::<L>(table, left + L::I::splat(1)))
+                (
+                    gathered::<L>(before, left),
+                    gathered::<L>(after, left),
+                    gathered::<L>(breaks, left).0,
+                )
             };
-            let nearer = L::F::select(share.lt(L::F::splat(0.5)), a, b);
-            let close = (b - a).abs().le(L::F::splat(NEIGHBOURS) * a.min(b));
-            let inverse = L::F::select(close, a + (b - a) * share, nearer);
-            let part = |n: usize| {
-                L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32)
-            };
-            let (x, y, z) = (part(0), part(1), part(2));
-            let across = x * x + y * y;
-            let stretch = (across + z * z).div(across * inverse * inverse).sqrt();
-            let distance = stretch;
-            seen.fallen += u64::from((!close).count());
+            let high = a.max(b).max(c.max(e));
+            let close = broken.eq(L::F::splat(0.0));
+            let (above, below) = (a + (b - a) * share, c + (e - c) * share);
+            let guess = above + (below - above) * down;
             let count = L::N.min((pixels.end - pixel) as usize);
-            let region = self.region;
+            let all = L::M::from_bits(u32::MAX >> (32 - count));
+            let sky = high.eq(L::F::splat(0.0));
+            let mut ray = [minor; 3];
+            for n in 0..3 {
+                ray[n] = L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32);
+            }
+            let (answer, sure) = self.settle::<L>(ray, guess, close & all & !sky);
+            let close = sure | (sky & close);
+            let mut strange = (!close).bits() & (u32::MAX >> (32 - count));
+            if strange != 0 {
+                high.store(&mut nearest);
+            }
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
                 if count == L::N {
-                    distance.store(&mut seen.distance[at..]);
+                    answer.store(&mut seen.inverse_depth[at..]);
                 } else {
-                    distance.store(&mut out);
-                    seen.distance[at..at + count].copy_from_slice(&out[..count]);
+                    answer.store(&mut out);
+                    seen.inverse_depth[at..at + count].copy_from_slice(&out[..count]);
+                }
+                while strange != 0 {
+                    let lane = strange.trailing_zeros();
+                    let free = free_before(nearest[lane as usize % MOST]);
+                    alone.push(Alone { at: at as u32 + lane, free });
+                    strange &= strange - 1;
                 }
             } else {
-                distance.store(&mut out);
+                answer.store(&mut out);
                 let at = (pixel - region.y) as usize * region.width as usize;
                 let column = (row - region.x) as usize;
-                let rows = seen.distance[at..].chunks_mut(region.width as usize);
-                for (pixels, &distance) in rows.zip(&out[..count]) {
-                    pixels[column] = distance;
+                let rows = seen.inverse_depth[at..].chunks_mut(region.width as usize);
+                for (pixels, &answer) in rows.zip(&out[..count]) {
+                    pixels[column] = answer;
+                }
+                while strange != 0 {
+                    let lane = strange.trailing_zeros();
+                    let free = free_before(nearest[lane as usize % MOST]);
+                    let at = (at + column) as u32 + lane * region.width;
+                    alone.push(Alone { at, free });
+                    strange &= strange - 1;
                 }
             }
-            seen.left -= count as u64;
-            pixel += L::N as u32;
         }
     }
 }
 
+impl Columns<'_, '_> {
+    /// Moves guesses along rays until they are on the surface. Returns which have got
+    /// there.
+    #[inline(always)]
+    fn settle<L: Lanes>(&self, ray: [L::F; 3], guess: L::F, lanes: L::M) -> (L::F, L::M) {
+        let one = L::F::splat(1.0);
+        let [x, y, z] = ray;
+        let across = x * x + y * y;
+        // The tolerance as a length at depth 1: |ray| / focal.
+        let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
+        let allowed = L::F::splat((allowed * allowed) as f32) * (across + z * z);
+        let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
+        for _ in 0..CORRECTIONS {
+            let depth = one.div(answer);
+            let (solid, ground, slopes) =
+                self.relief.surface::<L>([x * depth, y * depth], left);
+            let (height, rise) = if self.relief.curvature == 0.0 {
+                (z * depth, z)
+            } else {
+                let length = across.sqrt();
+                let slopes = Slopes::<L>::new(self.relief, z.div(length));
+                let bend = L::F::splat(self.relief.curvature as f32) * across * depth;
+                (slopes.height(length * depth), z + bend)
+            };
+            let off = height - ground;
+            let share = off * answer;
+            sure = sure | (left & solid & (share * share).le(allowed));
+            left = left & solid & !sure;
+            if !left.any() {
+                break;
+            }
+            let closing = rise - slopes[0] * x - slopes[1] * y;
+            let corrected = one.div(depth - off.div(closing));
+            let near = (corrected - answer).abs().lt(L::F::splat(FARTHEST) * answer);
+            left = left & near;
+            answer = L::F::select(left, corrected, answer);
+        }
+        (answer, sure)
+    }
+}
+
+/// The depth from which a pixel's own ray looks for ground, if the nearest that is seen
+/// around it has this inverse depth.
+fn free_before(nearest: f32) -> f32 {
+    if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 }
+}
+
+/// The numbers of the lanes.
+const NUMBERS: [f32; MOST] = {
+    let mut numbers = [0.0; MOST];
+    let mut lane = 0;
+    while lane < MOST {
+        numbers[lane] = lane as f32;
+        lane += 1;
+    }
+    numbers
+};
+
+/// Elements of a row and those after them, the first less than 2 N further on.
 #[inline(always)]
-fn gathered<L: Lanes>(table: &[u32], at: L::I) -> L::F {
-    L::F::from_bits(L::I::gather(table, at, !L::M::none()))
+fn looked_up<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    (L::F::lookup(row, at), L::F::lookup(&row[1..], at))
+}
+
+/// The same, however far on they are.
+#[inline(always)]
+fn gathered<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    let (row, all) = (as_bits(row), !L::M::none());
+    let next = at + L::I::splat(1);
+    (L::F::from_bits(L::I::gather(row, at, all)), L::F::from_bits(L::I::gather(row, next, all)))
 }

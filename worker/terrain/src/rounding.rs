@@ -5,20 +5,20 @@
 //! nothing and cost two bytes a post in memory and more on disk. They are rounded to a
 //! power of two that goes by the distance between posts:
 //!
-//! - The step is at most 1/256 of the spacing, so that the slope between two posts is off
-//!   by at most 1/256: less than a shade of grey.
-//! - The codes of a tile (see [`crate::tile`]) reach 65 533 steps: at least half the width
-//!   of the tile, a slope of 27 degrees from one side to the other. Steeper tiles exist
-//!   at most where posts are near each other; they are kept as floats.
+//! - The step is at most 1/128 of the spacing, so that a slope, taken over two cells as
+//!   shading does, is off by at most 1/256: a shade of grey.
+//! - The codes of a tile (see [`crate::tile`]) reach 65 533 steps. Up to a step of 1/8 m,
+//!   which is 8191 m of relief, that is at least the width of the tile: 45 degrees from
+//!   one side to the other. What is steeper is kept as floats.
 //! - It is the same for all tiles of a level, which share posts, and known before any
 //!   height is: one absurd height cannot spoil the others.
 
-/// The coarsest step, metres: it reaches over 8191 m of relief.
+/// The coarsest step, metres.
 const COARSEST_M: f64 = 1.0 / 8.0;
 /// The finest, metres: the finest that [`crate::tile`] keeps in two bytes.
 const FINEST_M: f64 = 1.0 / 1024.0;
 /// Steps within the distance between two posts ...
-const STEPS_IN_SPACING: f64 = 256.0;
+const STEPS_IN_SPACING: f64 = 128.0;
 /// ... and the fewest that may be, where the finest step is too coarse for that.
 const FEWEST_STEPS_IN_SPACING: f64 = 64.0;
 
@@ -59,12 +59,14 @@ mod tests {
         for (spacing, step) in [
             (1000.0, Some(1.0 / 8.0)),
             (90.0, Some(1.0 / 8.0)),
-            (32.0, Some(1.0 / 8.0)),
-            (25.0, Some(1.0 / 16.0)),
-            (10.0, Some(1.0 / 32.0)),
-            (4.0, Some(1.0 / 64.0)),
-            (1.0, Some(1.0 / 256.0)),
-            (0.25, Some(1.0 / 1024.0)),
+            (25.0, Some(1.0 / 8.0)),
+            (16.0, Some(1.0 / 8.0)),
+            (15.0, Some(1.0 / 16.0)),
+            (10.0, Some(1.0 / 16.0)),
+            (4.0, Some(1.0 / 32.0)),
+            (1.0, Some(1.0 / 128.0)),
+            (0.25, Some(1.0 / 512.0)),
+            (0.125, Some(1.0 / 1024.0)),
             (0.0625, Some(1.0 / 1024.0)),
             (0.06, None),
             (1e-300, None),

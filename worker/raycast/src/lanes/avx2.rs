@@ -5,7 +5,9 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask};
+mod doubles;
+
+use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -25,6 +27,7 @@ impl Lanes for Eight {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -211,6 +214,25 @@ impl Ints for I {
     fn select(mask: M, yes: I, no: I) -> I {
         // SAFETY: see the page of this module.
         unsafe { I(_mm256_blendv_epi8(no.0, yes.0, _mm256_castps_si256(mask.0))) }
+    }
+    #[inline(always)]
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: I, last: I, mask: M) -> I {
+        // SAFETY: see the page of this module; the caller has seen that so much can be read.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, last.0);
+            let mask = _mm256_castps_si256(mask.0);
+            let low = _mm256_cvtepu32_epi64(_mm256_castsi256_si128(at));
+            let high = _mm256_cvtepu32_epi64(_mm256_extracti128_si256::<1>(at));
+            let low = _mm256_add_epi64(low, _mm256_loadu_si256(bases.as_ptr().cast()));
+            let high = _mm256_add_epi64(high, _mm256_loadu_si256(bases[4..].as_ptr().cast()));
+            let none = _mm_setzero_si128();
+            let of_low = _mm256_castsi256_si128(mask);
+            let of_high = _mm256_extracti128_si256::<1>(mask);
+            let nowhere = std::ptr::null();
+            let low = _mm256_mask_i64gather_epi32::<1>(none, nowhere, low, of_low);
+            let high = _mm256_mask_i64gather_epi32::<1>(none, nowhere, high, of_high);
+            I(_mm256_set_m128i(high, low))
+        }
     }
     #[inline(always)]
     fn gather_pairs(table: &[u16], at: I, mask: M) -> I {

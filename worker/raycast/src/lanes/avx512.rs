@@ -2,7 +2,9 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
-use super::{Floats, Ints, Kernel, Lanes, Mask};
+mod doubles;
+
+use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -21,6 +23,7 @@ impl Lanes for Sixteen {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -208,6 +211,23 @@ impl Ints for I {
     fn select(mask: M, yes: I, no: I) -> I {
         // SAFETY: see the page of this module.
         unsafe { I(_mm512_mask_blend_epi32(mask.0, no.0, yes.0)) }
+    }
+    #[inline(always)]
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: I, last: I, mask: M) -> I {
+        // SAFETY: see the page of this module; the caller has seen that so much can be read.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, last.0);
+            let low = _mm512_cvtepu32_epi64(_mm512_castsi512_si256(at));
+            let high = _mm512_cvtepu32_epi64(_mm512_extracti64x4_epi64::<1>(at));
+            let low = _mm512_add_epi64(low, _mm512_loadu_si512(bases.as_ptr().cast()));
+            let high = _mm512_add_epi64(high, _mm512_loadu_si512(bases[8..].as_ptr().cast()));
+            let none = _mm256_setzero_si256();
+            let of_high = (mask.0 >> 8) as u8;
+            let nowhere = std::ptr::null();
+            let low = _mm512_mask_i64gather_epi32::<1>(none, mask.0 as u8, low, nowhere);
+            let high = _mm512_mask_i64gather_epi32::<1>(none, of_high, high, nowhere);
+            I(_mm512_inserti64x4::<1>(_mm512_castsi256_si512(low), high))
+        }
     }
     #[inline(always)]
     fn gather_pairs(table: &[u16], at: I, mask: M) -> I {

@@ -1,6 +1,8 @@
 //! A single lane: the scalar twin of every kernel.
 
-use super::{Floats, Ints, Lanes, Mask};
+mod doubles;
+
+use super::{Floats, Ints, Lanes, MOST, Mask};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
 #[derive(Clone, Copy)]
@@ -18,6 +20,7 @@ impl Lanes for One {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 macro_rules! operator {
@@ -190,6 +193,15 @@ impl Ints for I {
     #[inline(always)]
     fn select(mask: M, yes: I, no: I) -> I {
         if mask.0 { yes } else { no }
+    }
+    #[inline(always)]
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: I, last: I, mask: M) -> I {
+        if !mask.0 {
+            return I(0);
+        }
+        let at = (at.0 as u32).min(last.0 as u32) as usize;
+        // SAFETY: the caller has seen that so much can be read.
+        I(unsafe { bases[0].add(at).cast::<i32>().read_unaligned() })
     }
     #[inline(always)]
     fn gather_pairs(table: &[u16], at: I, mask: M) -> I {

@@ -60,14 +60,13 @@ fn answers_of_exact_itself_have_no_error() {
             let camera = Camera::from_angles(position, heading, pitch, roll, 75.0, (48, 36));
             let view = view(camera, (round % 2 == 1).then_some(EARTH));
             let region = Region::whole(48, 36);
-            let single = depths(&land.resident, &land.pyramid, &view, region).unwrap().distance_m;
-            for (at, single) in single.into_iter().enumerate() {
-                let (x, y) = (at as u32 % 48, at as u32 / 48);
+            let single = depths(&land.resident, &land.pyramid, &view, region).unwrap();
+            for [x, y] in region.pixels() {
                 let centre = [f64::from(x) + 0.5, f64::from(y) + 0.5];
                 let hit = land.look(&view, centre);
                 let double = hit.map_or(f64::INFINITY, |hit| hit.distance_m);
                 *(if hit.is_some() { &mut ground } else { &mut sky }) += 1;
-                for claimed in [double, f64::from(single)] {
+                for claimed in [double, single.distance_m(&view, x, y)] {
                     let error = gauge(&land, &view, (x, y), claimed);
                     let said = format!("{} {camera:?} {x} {y} {claimed}: {error:?}", land.name);
                     assert!(error.error_px() <= 1e-6 && !error.mismatch, "{said}");

@@ -349,9 +349,9 @@ fn an_inset_keeps_its_posts_and_joins_the_base_without_a_hole() {
             let inner = (1..201).contains(&i) && (1..151).contains(&j);
             let sample = if inner { samples[(150 - j) * 200 + i - 1] } else { f32::NAN };
             if sample.is_nan() {
-                // Borrowed heights are rounded to 1/128 m where posts are 2 m apart.
-                assert_eq!((height * 128.0).fract(), 0.0);
-                let half_step = 0.5 / 128.0;
+                // Borrowed heights are rounded to 1/64 m where posts are 2 m apart.
+                assert_eq!((height * 64.0).fract(), 0.0);
+                let half_step = 0.5 / 64.0;
                 assert!((height - base(x, y)).abs() < half_step + 1e-3, "{x} {y}: {height}");
             } else {
                 assert_eq!(height.to_bits(), sample.to_bits());

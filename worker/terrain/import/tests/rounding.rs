@@ -32,9 +32,9 @@ fn resampled_heights_are_multiples_of_a_step_and_the_report_says_so() {
     let mut heights = store.heights(0);
     heights.retain(|height| !height.is_nan());
     assert!(heights.len() > 1_040_000, "{}", heights.len());
-    assert!(heights.iter().all(|height| (height * 16.0).fract() == 0.0));
+    assert!(heights.iter().all(|height| (height * 8.0).fract() == 0.0));
     let line = &store.summary.report.inputs[0];
-    assert!(line.ends_with("resampled to 20 x 20 m, rounded to 1/16 m"), "{line}");
+    assert!(line.ends_with("resampled to 20 x 20 m, rounded to 1/8 m"), "{line}");
     assert!(store.summary.report.max_resampling_error_m > 1.0 / 64.0, "rounding is an error");
     assert!(bytes_per_post(&store) < 3.7, "{}", bytes_per_post(&store));
 }
@@ -87,6 +87,6 @@ fn an_inset_of_whole_metres_borrows_binary_fractions() {
     let heights = store.heights(1);
     let width = store.layer(1).posts[0] as usize;
     assert!(heights[..width].iter().any(|height| height.fract() != 0.0), "the ring is borrowed");
-    assert!(heights.iter().all(|height| (height * 32.0).fract() == 0.0));
+    assert!(heights.iter().all(|height| (height * 16.0).fract() == 0.0));
     assert!(heights[width + 1..2 * width - 1].iter().all(|height| height.fract() == 0.0));
 }

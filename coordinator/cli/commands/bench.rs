@@ -1,0 +1,32 @@
+//! `terrafarm bench`: what the methods cost, how far they are off, and where they fail.
+//!
+//! | command | question | module |
+//! |---|---|---|
+//! | `bench core` | how fast is each method on one core? | `core` |
+//! | `bench speed-accuracy` | what does a smaller error cost? | `speed_accuracy`, `chart` |
+//! | `bench stability` | is any method silently wrong where it is known to be hard? | `stability` |
+//!
+//! Nothing is timed or charted without being checked, and a method that breaks its
+//! promise makes the exit code 1. `land` makes and loads the terrain, `kernel` asks the
+//! ray caster, `clock` reads the time that this thread had on a core.
+
+mod chart;
+mod clock;
+mod core;
+mod kernel;
+mod land;
+mod report;
+mod speed_accuracy;
+mod stability;
+
+use crate::Outcome;
+use crate::args;
+
+/// Carries out a bench.
+pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
+    match args {
+        args::Bench::Core(args) => core::run(args),
+        args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
+        args::Bench::Stability(args) => stability::run(args),
+    }
+}

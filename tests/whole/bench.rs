@@ -1,0 +1,102 @@
+//! Short runs of every bench: what is reported, and that nothing is wrong.
+
+use crate::support::{Dir, World, run, succeed, terrafarm};
+use serde_json::Value;
+use std::path::Path;
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+#[test]
+fn the_core_bench_reports_every_method_and_camera_and_checks_them() {
+    let dir = Dir::new();
+    let report = dir.path("core.json");
+    let text = succeed(
+        terrafarm()
+            .args(["bench", "core", "--posts", "129,257", "--size", "96x54", "--repeats", "1"])
+            .args(["--methods", "exact,reference", "--json"])
+            .arg(&report),
+    );
+    assert!(text.contains("rolled45"), "{text}");
+    let report = json(&report);
+    let cases = report["cases"].as_array().unwrap();
+    assert_eq!(cases.len(), 2 * 4 * 2);
+    for case in cases {
+        assert_eq!(case["outcome"], "timed", "{case}");
+        for key in ["mpix_per_cpu_s", "steps_per_pixel", "ns_per_pixel", "bytes_per_post"] {
+            assert!(case[key].as_f64().unwrap() > 0.0, "{key} in {case}");
+        }
+        assert!(case["error_px_max"].as_f64().unwrap() <= 0.01, "{case}");
+    }
+}
+
+#[test]
+fn the_core_bench_takes_its_cameras_from_a_flight_and_its_terrain_from_a_store() {
+    let world = World::new(100);
+    let report = world.dir.path("core.json");
+    succeed(
+        terrafarm()
+            .args(["bench", "core", "--size", "32x18", "--repeats", "2", "--methods", "exact"])
+            .arg("--terrain")
+            .arg(world.dir.path("land.terrain"))
+            .arg("--flight")
+            .arg(&world.flight)
+            .arg("--json")
+            .arg(&report),
+    );
+    let report = json(&report);
+    let cameras: Vec<_> =
+        report["cases"].as_array().unwrap().iter().map(|case| case["camera"].as_u64()).collect();
+    assert_eq!(cameras, [Some(0), Some(1)]);
+    assert_eq!(report["cases"][0]["posts"], 100);
+    run(terrafarm().args(["bench", "core", "--tolerance", "0"]), 2);
+}
+
+#[test]
+fn the_chart_of_speed_and_accuracy_has_every_method_and_both_forms() {
+    let dir = Dir::new();
+    let [report, svg, png] = ["sa.json", "sa.svg", "sa.png"].map(|name| dir.path(name));
+    let mut command = terrafarm();
+    command.args(["bench", "speed-accuracy", "--short", "--json"]).arg(&report);
+    let ended = command.arg("--svg").arg(&svg).arg("--png").arg(&png).output().unwrap();
+    let text = String::from_utf8(ended.stdout).unwrap();
+    assert!(text.contains("on the Pareto front"), "{text}");
+    let report = json(&report);
+    let points = report["points"].as_array().unwrap();
+    let refused = report["refused"].as_array().unwrap();
+    assert_eq!(points.len() + refused.len(), 4 * (4 * 7 + 2 + 3));
+    let broken = points.iter().filter(|point| point["kept"] == false).count();
+    assert_eq!(ended.status.code(), Some(i32::from(broken > 0)), "{text}");
+    for point in points.iter().filter(|point| point["method"] == "exact") {
+        assert!(point["error_px_max"].as_f64().unwrap() <= 0.01, "{point}");
+    }
+    let truth: Vec<_> = points.iter().filter(|point| point["setting"] == "64 samples").collect();
+    assert_eq!(truth.len(), 4);
+    assert!(truth.iter().all(|point| point["image_error"] == 0.0), "{truth:?}");
+    assert!(std::fs::read_to_string(&svg).unwrap().contains("reference"));
+    let picture = png::Decoder::new(std::io::BufReader::new(std::fs::File::open(&png).unwrap()));
+    assert!(picture.read_info().unwrap().info().width > 1000);
+}
+
+#[test]
+fn the_stability_suite_finds_exact_and_reference_in_bound_everywhere() {
+    let dir = Dir::new();
+    let report = dir.path("stability.json");
+    let mut command = terrafarm();
+    let ended = command.args(["bench", "stability", "--short", "--json"]).arg(&report);
+    let ended = ended.output().unwrap();
+    let report = json(&report);
+    let cells = report["cells"].as_array().unwrap();
+    for cell in cells {
+        let method = cell["method"].as_str().unwrap();
+        if ["exact", "reference", "flight", "hillshade"].contains(&method) {
+            assert_ne!(cell["outcome"], "silent", "{cell}");
+        }
+    }
+    let scenes: std::collections::BTreeSet<_> =
+        cells.iter().map(|cell| cell["scene"].as_str().unwrap()).collect();
+    assert!(scenes.len() >= 30, "{scenes:?}");
+    let silent = cells.iter().filter(|cell| cell["outcome"] == "silent").count();
+    assert_eq!(ended.status.code(), Some(i32::from(silent > 0)));
+}

@@ -1,0 +1,200 @@
+//! Where the rays of `column` go through the picture.
+//!
+//! All vertical planes through the camera appear as lines through one point V of the
+//! picture, the one straight below the camera or straight above (infinitely far if the
+//! camera looks level). A pixel belongs to the rows of the picture or to its columns,
+//! whichever its line crosses less slantingly. Rows are taken in *bands*, from the row
+//! furthest from V towards it: lines are a given spacing apart in the first row of a band,
+//! and by the last one have come so close that a new band with fewer of them begins.
+//!
+//! All of this follows from the camera alone, not from the region that is asked for. The
+//! *major* axis is that across rows (or columns), the *minor* one is along them.
+
+use glam::DVec3;
+use std::ops::Range;
+use terrafarm_common::camera::Camera;
+
+/// Pixels closer to V than this belong to no band.
+const NEAREST_PX: f64 = 8.0;
+/// A band ends where its lines are closer than this share of the spacing. Not less than
+/// a half: `column` looks N pixels up among 2 N lines.
+const CLOSEST: f64 = 0.55;
+
+/// The picture with rows as the major axis, or columns.
+pub(crate) struct Frame {
+    pub by_rows: bool,
+    /// Direction of the ray through the corner of the picture ...
+    pub corner: DVec3,
+    /// ... and how it changes from pixel to pixel along the minor and the major axis.
+    pub minor: DVec3,
+    pub major: DVec3,
+    /// V: along minor, along major, and what both are to be divided by.
+    v: [f64; 3],
+    /// Pixels along the minor and the major axis.
+    size: [u32; 2],
+}
+
+/// Rows of which the first has its lines at the spacing, and the others closer.
+pub(crate) struct Band {
+    pub rows: Range<u32>,
+    /// The first row is the last of the range: the band goes up the picture.
+    pub falling: bool,
+}
+
+/// The lines of a band and the rays on them. Line k goes through `K = (k + 1/2) spacing` in
+/// the reference row, at its middle, and through `K + d (K q - r)` d rows further on. Ray j
+/// of each line goes through the row `j every` rows from the reference row towards V.
+pub(crate) struct Fan {
+    pub reference: f64,
+    pub spacing: f64,
+    /// Rows from ray to ray, with the sign of the way.
+    pub every: f64,
+    pub q: f64,
+    pub r: f64,
+}
+
+impl Frame {
+    pub(crate) fn new(camera: &Camera, by_rows: bool) -> Self {
+        let scale = 1.0 / camera.focal_px();
+        let (across, down) = (camera.right * scale, -camera.up * scale);
+        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+        let corner = camera.forward - across * (0.5 * width) - down * (0.5 * height);
+        let w = -camera.forward.z;
+        let focal = camera.focal_px();
+        let x = 0.5 * width * w - focal * camera.right.z;
+        let y = 0.5 * height * w + focal * camera.up.z;
+        if by_rows {
+            let size = [camera.width, camera.height];
+            Frame { by_rows, corner, minor: across, major: down, v: [x, y, w], size }
+        } else {
+            let size = [camera.height, camera.width];
+            Frame { by_rows, corner, minor: down, major: across, v: [y, x, w], size }
+        }
+    }
+
+    /// How far a row is from V, with a sign for the side; in units of V's last part.
+    fn apart(&self, row: f64) -> f64 {
+        row * self.v[2] - self.v[1]
+    }
+
+    /// Whether a pixel is seen along this frame's rows rather than its columns.
+    pub(crate) fn owns(&self, minor: u32, major: u32) -> bool {
+        let across = ((f64::from(minor) + 0.5) * self.v[2] - self.v[0]).abs();
+        let along = self.apart(f64::from(major) + 0.5).abs();
+        // A tie goes to the rows of the picture.
+        if self.by_rows { along >= across } else { along > across }
+    }
+
+    /// The part of the picture in which pixels may be too close to V for any band: columns
+    /// and rows of the picture, if V is in it.
+    pub(crate) fn around_v(&self) -> Option<[Range<u32>; 2]> {
+        let [minor, major, w] = self.v;
+        let range = |at: f64, size: u32| {
+            let (low, high) = (at / w - NEAREST_PX - 2.0, at / w + NEAREST_PX + 2.0);
+            let range = low.clamp(0.0, f64::from(size)) as u32..high.clamp(0.0, f64::from(size)) as u32;
+            (!range.is_empty()).then_some(range)
+        };
+        let (minor, major) = (range(minor, self.size[0])?, range(major, self.size[1])?);
+        Some(if self.by_rows { [minor, major] } else { [major, minor] })
+    }
+
+    /// Whether a row is too close to V for any band.
+    pub(crate) fn is_near(&self, row: u32) -> bool {
+        self.apart(f64::from(row) + 0.5).abs() <= NEAREST_PX * self.v[2].abs()
+    }
+
+    /// The bands of the picture, each from the row furthest from V towards it.
+    pub(crate) fn bands(&self) -> Vec<Band> {
+        let mut bands = Vec::new();
+        let last = self.size[1];
+        let middle = |row: u32| f64::from(row) + 0.5;
+        for positive in [false, true] {
+            // Rows on this side of V that are not too close to it.
+            let near = NEAREST_PX * self.v[2].abs();
+            let on_side = |row: u32| {
+                let apart = self.apart(middle(row));
+                if positive { apart > near } else { apart < -near }
+            };
+            let (first, end) = match ((0..last).find(|&row| on_side(row)), (0..last).rfind(|&row| on_side(row))) {
+                (Some(first), Some(end)) => (first, end + 1),
+                _ => continue,
+            };
+            let mut rest = first..end;
+            while !rest.is_empty() {
+                let (low, high) =
+                    (self.apart(middle(rest.start)).abs(), self.apart(middle(rest.end - 1)).abs());
+                let half = CLOSEST * low.max(high);
+                let far_first = low >= high;
+                let inside = |row: &u32| self.apart(middle(*row)).abs() >= half;
+                if far_first {
+                    let cut = rest.clone().take_while(inside).last().map_or(rest.start, |row| row) + 1;
+                    bands.push(Band { rows: rest.start..cut, falling: false });
+                    rest.start = cut;
+                } else {
+                    let cut = rest.clone().rev().take_while(inside).last().map_or(rest.end - 1, |row| row);
+                    bands.push(Band { rows: cut..rest.end, falling: true });
+                    rest.end = cut;
+                }
+            }
+        }
+        bands
+    }
+
+    /// The lines of a band, so many pixels apart, as the rays on them are.
+    pub(crate) fn fan(&self, band: &Band, spacing: f64) -> Fan {
+        let first = if band.falling { band.rows.end - 1 } else { band.rows.start };
+        let reference = f64::from(first) + 0.5;
+        let scale = 1.0 / self.apart(reference);
+        let every = (0.5 * spacing).floor().max(1.0);
+        Fan {
+            reference,
+            spacing,
+            every: if band.falling { -every } else { every },
+            q: self.v[2] * scale,
+            r: self.v[0] * scale,
+        }
+    }
+
+    /// The pixels of a row, of those from `minors`, that are seen along this frame's rows:
+    /// those no further from V across than along.
+    pub(crate) fn owned(&self, row: u32, minors: Range<u32>) -> Range<u32> {
+        let none = minors.start..minors.start;
+        if minors.is_empty() {
+            return none;
+        }
+        let owns = |minor: u32| self.owns(minor, row);
+        if owns(minors.start) && owns(minors.end - 1) {
+            return minors;
+        }
+        let reach = self.apart(f64::from(row) + 0.5).abs();
+        let (a, b) = ((self.v[0] - reach) / self.v[2], (self.v[0] + reach) / self.v[2]);
+        let pixel = |place: f64| (place - 0.5).clamp(-1.0, f64::from(u32::MAX)) as u32;
+        let (mut first, mut last) = (pixel(a.min(b)), pixel(a.max(b)) + 1);
+        first = first.saturating_sub(1).clamp(minors.start, minors.end - 1);
+        last = (last + 1).clamp(minors.start, minors.end - 1);
+        // What is left of rounding.
+        while first < last && !owns(first) {
+            first += 1;
+        }
+        while last > first && !owns(last) {
+            last -= 1;
+        }
+        if owns(first) { first..last + 1 } else { none }
+    }
+}
+
+impl Fan {
+    /// The rays that a row lies between: the one before, as a number of rays from the
+    /// reference row, and how far it is to the next, 0 to 1.
+    pub(crate) fn rays(&self, row: u32) -> (usize, f32) {
+        let place = (f64::from(row) + 0.5 - self.reference) / self.every;
+        let before = place.floor().max(0.0);
+        (before as usize, (place - before) as f32)
+    }
+
+    /// The line through a point of a row, as a number that counts from line 0.
+    pub(crate) fn line(&self, minor: f64, row: f64) -> f64 {
+        let d = row - self.reference;
+        (minor + d * self.r) / (1.0 + d * self.q) / self.spacing - 0.5
+    }
+}

@@ -1,0 +1,46 @@
+//! What a method has seen of a region, or why it will not look.
+
+use std::fmt;
+use terrafarm_common::quality::Method;
+use terrafarm_common::region::Region;
+
+/// Depths, pixel by pixel, and what they took.
+pub(crate) struct Seen {
+    /// One over the depth of what the ray through the pixel's centre sees, per metre: 0 for
+    /// the sky, NaN where a tile is missing. See [`crate::Depths::inverse_depth`].
+    pub inverse_depth: Vec<f32>,
+    /// Blocks and cells looked at.
+    pub steps: u64,
+    /// Rays cast.
+    pub rays: u64,
+    /// Pixels that fell back to a ray of their own.
+    pub alone: u64,
+}
+
+impl Seen {
+    /// Nothing is known of any pixel.
+    pub(crate) fn new(region: Region) -> Self {
+        let inverse_depth = vec![f32::NAN; region.area() as usize];
+        Seen { inverse_depth, steps: 0, rays: 0, alone: 0 }
+    }
+}
+
+/// A method was asked for something that it is not made for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unfit {
+    /// The method.
+    pub method: Method,
+    /// What it cannot do here, in words.
+    pub why: String,
+    /// A method that can.
+    pub instead: Method,
+}
+
+impl fmt::Display for Unfit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Unfit { method, why, instead } = self;
+        write!(f, "method {method} cannot do this: {why}; use {instead}, or auto")
+    }
+}
+
+impl std::error::Error for Unfit {}
