@@ -21,10 +21,15 @@
 //! Height grows both with the square of the map distance and with the straight rise (see
 //! `path`), so it is bounded from below over an interval of depths by the least of both.
 
+mod abreast;
+
+use crate::exact::{Globe, Tiles};
 use crate::field::{Cursor, Field, Ground, tile_key};
 use crate::grid::cells_of;
+use crate::lanes;
 use crate::path;
 use crate::pyramid::Pyramid;
+use abreast::{Layer, Narrow, Squares};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -59,6 +64,9 @@ pub(crate) struct Beams<'a> {
     first_step: f64,
     /// Room to be kept above the ground, metres for each metre away.
     slack: f64,
+    /// The only height layer, if there is but one.
+    only: Option<Layer<'a>>,
+    squares: Squares,
     /// Intervals of depth looked at.
     pub steps: u64,
 }
@@ -118,14 +126,48 @@ impl<'a> Beams<'a> {
             let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
             Grid { number, eye, scale, cells }
         });
-        let layers = layers.collect();
-        Beams { field, camera, ground, layers, tiles: Cursor::new(field), first_step, slack, steps: 0 }
+        let layers: Vec<Grid> = layers.collect();
+        let only = match &layers[..] {
+            [grid] if !grid.cells.contains(&0) => Some(Layer {
+                camera,
+                globe: (ground.curvature() != 0.0).then(|| Globe::new(&ground, eye.z)),
+                eye: grid.eye,
+                scale: grid.scale,
+                cells: grid.cells,
+                highest: field.pyramid.highest(),
+                finest_step: 1.0 / grid.scale[0].max(grid.scale[1]),
+                slack,
+                tiles: Tiles::new(field, grid.number),
+            }),
+            _ => None,
+        };
+        let (tiles, squares) = (Cursor::new(field), Squares::new());
+        Beams { field, camera, ground, layers, tiles, first_step, slack, only, squares, steps: 0 }
     }
 
     /// Calls `see` for each pixel of a square with the depth up to which every ray
     /// through the pixel is free.
     pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(u32, u32, f64)) {
-        self.quarter(square, WIDEST_PX, Front { free: 0.0, step: self.first_step }, see);
+        let front = Front { free: 0.0, step: self.first_step };
+        if self.only.is_none() {
+            return self.quarter(square, WIDEST_PX, front, see);
+        }
+        let front = self.advance(&self.bounds(square), front);
+        let Some(layer) = &mut self.only else { return };
+        // Quarters are counted from the corner of the square, which a region may cut.
+        let squares = &mut self.squares;
+        squares.set(square.x, square.y, front.free, front.step);
+        let narrow = Narrow { layer, region: square, squares };
+        self.steps += lanes::run(narrow, lanes::widest());
+        let (right, bottom) = (square.x + square.width, square.y + square.height);
+        for at in 0..self.squares.count {
+            let (left, top) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
+            for row in top..(top + NARROWEST_PX).min(bottom) {
+                for column in left..(left + NARROWEST_PX).min(right) {
+                    see(column, row, self.squares.free[at]);
+                }
+            }
+        }
     }
 
     fn quarter(

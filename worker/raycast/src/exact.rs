@@ -23,7 +23,9 @@ mod many;
 mod rays;
 mod tiles;
 
+pub(crate) use arc::Globe;
 pub(crate) use many::Many;
+pub(crate) use tiles::Tiles;
 
 use crate::cell::{first_contact, place_in_cell};
 use crate::field::{

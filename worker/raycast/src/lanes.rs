@@ -15,10 +15,6 @@ mod avx2;
 mod avx512;
 mod one;
 
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx2::Eight;
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx512::Sixteen;
 pub(crate) use one::One;
 
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -135,12 +131,7 @@ pub(crate) trait Ints:
     ///
     /// # Safety
     /// For each lane in `mask`, `last + 4` bytes from its base can be read.
-    unsafe fn gather_from(
-        bases: &[*const u8; MOST],
-        at: Self,
-        last: Self,
-        mask: Self::M,
-    ) -> Self;
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: Self, last: Self, mask: Self::M) -> Self;
     /// For each lane in `mask` the elements `at` (low half) and `at + 1` (high half) of a
     /// table of at least two; lanes outside get 0. An index outside the table reads from
     /// its end.

@@ -11,23 +11,41 @@
 //! ```
 //!
 //! Every operation that bears on a contact is that of the slow twin (`exact`, `cell`,
-//! `grid`, `path`), in the same order, on the same numbers: so are the bits. What is left
-//! to the twin: rays along the lines of the grid, and rays that come to a tile which is
-//! not loaded. There are other levels to skip by: none above a tile.
+//! `grid`, `path`), in the same order, on the same numbers: so are the bits.
+//!
+//! What else differs costs time at most. A contact is the first in the order of the cells,
+//! and each cell's answer depends on the ray and the cell alone; so a walk may come to
+//! any number of cells too early, but must leave out none that the twin tests.
+//!
+//! - Blocks are passed by the twin's comparison, with its clearance.
+//! - Behind a block the twin finds the cell at `u` by comparing with both of its lines.
+//!   Here the position is moved back by `slack` instead. Where lines are crossed is
+//!   `(line - start) * (1 / rate)`, the position `start + u * rate`: five roundings, each
+//!   of at most 2^-53 of `1 + |start| + cells`, of which `slack` is 32. So the cell is the
+//!   twin's or the one before, whose exit is at or before `u`: tested, it has nothing to
+//!   hit after the first of the course or was known to be free; passed, it leads on. No
+//!   walk goes back behind a cell that it has reached, so it ends.
+//! - There are no levels above a tile.
+//!
+//! Left to the twin are rays along the lines of the grid, and rays that come to a tile
+//! which is not loaded, from their start on.
 
 use super::CLEARANCE_M;
-use super::FIRST_LEVEL;
 use super::arc::{Globe, Rise, Spans};
 use super::rays::{Part, Rays, Verdict};
 use super::tiles::Tiles;
 use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
-use crate::path::{FLAT_REACH_M, REACH_RAD};
 use crate::painter::ROUNDING;
+use crate::path::{FLAT_REACH_M, REACH_RAD};
 use terrafarm_common::camera::Camera;
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
 /// The share of lanes that must be done before they take new rays: one in so many.
 const IDLE_SHARE: usize = 4;
+
+/// Level at which a walk begins. Measured with `examples/bench.rs`: beams end closer to
+/// the ground than a block of 2 is high.
+const FIRST_LEVEL: i32 = 1;
 
 /// What all rays have in common.
 #[derive(Clone, Copy)]
@@ -37,6 +55,8 @@ pub(super) struct Sight<'a> {
     pub globe: Option<Globe>,
     /// The camera, in cells from post (0, 0).
     pub start: [f64; 2],
+    /// What rounding may add to positions along x and y, cells.
+    pub slack: [f64; 2],
     /// Cells per metre.
     pub scale: [f64; 2],
     pub cells: [i32; 2],
@@ -56,23 +76,25 @@ impl Kernel for Abreast<'_, '_> {
 
     #[inline(always)]
     fn run<L: Lanes>(mut self) -> u64 {
-        match self.sight.globe {
+        let steps = match self.sight.globe {
             None => {
                 self.aim::<L, false>();
                 self.walk::<L, false>()
             }
-            Some(globe) => {
+            Some(_) => {
                 self.aim::<L, true>();
-                let steps = self.walk::<L, true>();
-                self.measure::<L>(&globe);
-                steps
+                self.walk::<L, true>()
             }
-        }
+        };
+        self.measure::<L>();
+        steps
     }
 }
 
 /// Lanes on their way.
 struct Walk<L: Lanes> {
+    /// Those that are not done.
+    active: L::M,
     /// The number of the ray.
     ray: L::I,
     cell: [L::I; 2],
@@ -175,7 +197,8 @@ impl Abreast<'_, '_> {
             z = spans.z(begin);
             first = first.max(spans.start_u);
             last = last.min(spans.end_u);
-            let away = L::D::splat(sight.highest).lt(spans.start_z) & L::D::splat(0.0).le(spans.slope);
+            let away =
+                L::D::splat(sight.highest).lt(spans.start_z) & L::D::splat(0.0).le(spans.slope);
             over = over & !away;
             self.store::<L>(Part::Across, at, across);
             self.store::<L>(Part::End, at, exit);
@@ -224,67 +247,77 @@ impl Abreast<'_, '_> {
         value.store(&mut self.rays.part_mut(part)[at..]);
     }
 
-    /// Distances of all contacts over a round Earth.
+    /// One over the depths of all contacts.
     #[inline(always)]
-    fn measure<L: Lanes>(&mut self, globe: &Globe) {
+    fn measure<L: Lanes>(&mut self) {
+        let [x, y, z] = self.sight.camera.forward.to_array();
         let mut at = 0;
         while at < self.rays.count {
-            let across = self.load::<L>(Part::Across, at);
-            let rise = Rise::<L> { across, up: self.load::<L>(Part::DirectionZ, at) };
-            let (u, z) = (self.load::<L>(Part::U, at), self.load::<L>(Part::Z, at));
-            let distance = globe.distance(&rise, u, z);
-            self.store::<L>(Part::Distance, at, distance);
+            let along_axis = self.load::<L>(Part::DirectionX, at) * L::D::splat(x)
+                + self.load::<L>(Part::DirectionY, at) * L::D::splat(y)
+                + self.load::<L>(Part::DirectionZ, at) * L::D::splat(z);
+            let depth = self.load::<L>(Part::U, at) * along_axis;
+            self.store::<L>(Part::InverseDepth, at, L::D::splat(1.0).div(depth));
             at += L::N;
         }
     }
 
+    /// Casts all rays, by two sets of lanes in turn: each takes a step while the other
+    /// waits for the outcome of its own.
     #[inline(always)]
     fn walk<L: Lanes, const ROUND: bool>(&mut self) -> u64 {
-        let count = self.rays.count;
-        let mut walk = Walk::<L>::new();
-        let (zero, one) = (L::I::splat(0), L::I::splat(1));
-        let mut active = L::M::none();
+        let mut walks = [Walk::<L>::new(), Walk::<L>::new()];
         let (mut taken, mut steps) = (0, 0);
-        loop {
-            let idle = !active;
-            if taken < count && idle.count() as usize * IDLE_SHARE >= L::N {
-                walk.refill::<ROUND>(&self.sight, self.rays, taken, idle);
-                active = active | (idle & walk.u.lt(walk.last));
-                taken += idle.count() as usize;
-                continue;
-            }
-            if !active.any() {
-                return steps;
-            }
-            let cells = active & walk.level.eq(zero);
-            let blocks = active & !cells;
-            let exits = walk.exits::<ROUND>(&self.sight);
-            if cells.count() >= blocks.count() {
-                steps += u64::from(cells.count());
-                let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells);
-                if hits.any() {
-                    self.keep_hits(&walk, hits, u, z);
+        let mut left = true;
+        while left {
+            left = false;
+            for walk in &mut walks {
+                let idle = !walk.active;
+                if taken < self.rays.count && idle.count() as usize * IDLE_SHARE >= L::N {
+                    walk.refill::<ROUND>(&self.sight, self.rays, taken, idle);
+                    taken += idle.count() as usize;
                 }
-                if absent.any() {
-                    self.leave_open(&walk, absent);
+                if walk.active.any() {
+                    steps += self.step::<L, ROUND>(walk);
+                    left = true;
                 }
-                active = active & !(hits | absent);
-                let gone = walk.pass::<ROUND>(&self.sight, &exits, cells & active);
-                active = active & !gone;
-            } else {
-                steps += u64::from(blocks.count());
-                let (highest, absent) = self.tiles.maxima::<L>(walk.cell, walk.level, blocks);
-                let clear = blocks & walk.clears::<ROUND>(&exits, highest);
-                if absent.any() {
-                    self.leave_open(&walk, absent);
-                    active = active & !absent;
-                }
-                let down = blocks & !clear;
-                walk.level = L::I::select(down, walk.level - one, walk.level);
-                let beside = walk.beside(&self.sight, &exits);
-                let gone = walk.pass_beside::<ROUND>(&self.sight, &exits, clear & active, beside);
-                active = active & !gone;
             }
+            left |= taken < self.rays.count;
+        }
+        steps
+    }
+
+    /// Takes lanes that are at a block a step further, or those that are at a cell:
+    /// whichever are more. Returns how many.
+    #[inline(always)]
+    fn step<L: Lanes, const ROUND: bool>(&mut self, walk: &mut Walk<L>) -> u64 {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let cells = walk.active & walk.level.eq(zero);
+        let blocks = walk.active & !cells;
+        let exits = walk.exits::<ROUND>(&self.sight);
+        if cells.count() >= blocks.count() {
+            let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells);
+            if hits.any() {
+                self.keep_hits(walk, hits, u, z);
+            }
+            if absent.any() {
+                self.leave_open(walk, absent);
+            }
+            walk.active = walk.active & !(hits | absent);
+            walk.pass::<ROUND>(&self.sight, &exits, cells & walk.active);
+            u64::from(cells.count())
+        } else {
+            let (highest, absent) = self.tiles.maxima::<L>(walk.cell, walk.level, blocks);
+            let clear = blocks & walk.clears::<ROUND>(&exits, highest);
+            if absent.any() {
+                self.leave_open(walk, absent);
+                walk.active = walk.active & !absent;
+            }
+            let down = blocks & !clear;
+            walk.level = L::I::select(down, walk.level - one, walk.level);
+            let beside = walk.beside(&self.sight, &exits);
+            walk.pass_beside::<ROUND>(&self.sight, &exits, clear & walk.active, beside);
+            u64::from(blocks.count())
         }
     }
 
@@ -329,6 +362,7 @@ impl<L: Lanes> Walk<L> {
     fn new() -> Self {
         let (none, zero) = (L::D::splat(0.0), L::I::splat(0));
         Walk {
+            active: L::M::none(),
             ray: zero,
             cell: [zero; 2],
             level: zero,
@@ -387,25 +421,24 @@ impl<L: Lanes> Walk<L> {
         };
         let number = L::D::splat(0.0).refill(&RANKS, lanes).truncate() + L::I::splat(at as i32);
         self.ray = L::I::select(lanes, number, self.ray);
-        self.level = L::I::select(lanes, L::I::splat(FIRST_LEVEL as i32), self.level);
+        self.level = L::I::select(lanes, L::I::splat(FIRST_LEVEL), self.level);
         let zero = L::I::splat(0);
         for axis in 0..2 {
             let forward = L::D::splat(0.0).lt(self.rate[axis]);
             self.ahead[axis] = L::I::select(forward, L::I::splat(1), zero);
-            let cell = self.cell_after(sight, axis, self.u);
+            let cell = self.cell_at(sight, axis, self.u);
             self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
         }
+        self.active = self.active | (lanes & self.u.lt(self.last));
     }
 
-    /// The cell of an axis in which the rays are just after `u`.
+    /// The cell of an axis in which the rays are at `u`, or the one before.
     #[inline(always)]
-    fn cell_after(&self, sight: &Sight, axis: usize, u: L::D) -> L::I {
-        cell_after::<L>(
-            u,
-            L::D::splat(sight.start[axis]),
-            self.rate[axis],
-            self.inverse[axis],
-            self.ahead[axis],
+    fn cell_at(&self, sight: &Sight, axis: usize, u: L::D) -> L::I {
+        cell_at::<L>(
+            L::D::splat(sight.start[axis]) + u * self.rate[axis],
+            L::D::splat(sight.slack[axis]),
+            L::I::splat(0).lt(self.ahead[axis]),
             L::I::splat(sight.cells[axis] - 1),
         )
     }
@@ -453,32 +486,27 @@ impl<L: Lanes> Walk<L> {
         (highest + L::D::splat(CLEARANCE_M)).lt(lowest)
     }
 
-    /// The cells, along the line by which the rays leave their blocks, at its crossing.
+    /// The cells, along the line by which the rays leave their blocks, at its crossing, or
+    /// the ones before.
     #[inline(always)]
     fn beside(&self, sight: &Sight, exits: &Exits<L>) -> L::I {
         let north = exits.north;
-        let start = sight.start;
+        let start = [L::D::splat(sight.start[0]), L::D::splat(sight.start[1])];
+        let slack = [L::D::splat(sight.slack[0]), L::D::splat(sight.slack[1])];
         let (x, y) = (L::I::splat(sight.cells[0] - 1), L::I::splat(sight.cells[1] - 1));
-        cell_after::<L>(
-            exits.u,
-            L::D::select(north, L::D::splat(start[0]), L::D::splat(start[1])),
-            L::D::select(north, self.rate[0], self.rate[1]),
-            L::D::select(north, self.inverse[0], self.inverse[1]),
-            L::I::select(north, self.ahead[0], self.ahead[1]),
-            L::I::select(north, x, y),
-        )
+        let rate = L::D::select(north, self.rate[0], self.rate[1]);
+        let ahead = L::I::splat(0).lt(L::I::select(north, self.ahead[0], self.ahead[1]));
+        let position = L::D::select(north, start[0], start[1]) + exits.u * rate;
+        let slack = L::D::select(north, slack[0], slack[1]);
+        let cell = cell_at::<L>(position, slack, ahead, L::I::select(north, x, y));
+        further::<L>(cell, L::I::select(north, self.cell[0], self.cell[1]), ahead)
     }
 
-    /// Goes on behind cells. Returns the lanes that have no more way to go.
+    /// Goes on behind cells; lanes that have no more way to go are done.
     #[inline(always)]
-    fn pass<const ROUND: bool>(
-        &mut self,
-        sight: &Sight,
-        exits: &Exits<L>,
-        lanes: L::M,
-    ) -> L::M {
+    fn pass<const ROUND: bool>(&mut self, sight: &Sight, exits: &Exits<L>, lanes: L::M) {
         let beside = L::I::select(exits.north, self.cell[0], self.cell[1]);
-        self.pass_beside::<ROUND>(sight, exits, lanes, beside)
+        self.pass_beside::<ROUND>(sight, exits, lanes, beside);
     }
 
     #[inline(always)]
@@ -488,7 +516,7 @@ impl<L: Lanes> Walk<L> {
         exits: &Exits<L>,
         lanes: L::M,
         beside: L::I,
-    ) -> L::M {
+    ) {
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
         let north = exits.north;
         self.u = L::D::select(lanes, exits.u, self.u);
@@ -513,7 +541,7 @@ impl<L: Lanes> Walk<L> {
                 gone = gone & !self.join(sight, joint);
             }
         }
-        gone
+        self.active = self.active & !gone;
     }
 
     /// Goes on in the next spans. Returns the lanes that need to.
@@ -527,7 +555,9 @@ impl<L: Lanes> Walk<L> {
         self.last = L::D::select(lanes, self.end.min(spans.end_u), self.last);
         self.z = L::D::select(lanes, self.spans.z(self.u), self.z);
         for axis in 0..2 {
-            let cell = self.cell_after(sight, axis, self.u);
+            let ahead = L::I::splat(0).lt(self.ahead[axis]);
+            let cell = self.cell_at(sight, axis, self.u);
+            let cell = further::<L>(cell, self.cell[axis], ahead);
             self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
         }
         let highest = L::D::splat(sight.highest);
@@ -644,23 +674,17 @@ fn lerp<L: Lanes>(a: L::D, b: L::D, t: L::D) -> L::D {
     a + (b - a) * t
 }
 
-/// `GridRay::cell_after`, given what it has of the axis.
+/// The cells of an axis in which rays are at a position, or the ones before, by what
+/// rounding adds. A cell too early is left in the next step; one too late would leave
+/// ground out.
 #[inline(always)]
-fn cell_after<L: Lanes>(
-    u: L::D,
-    start: L::D,
-    rate: L::D,
-    inverse: L::D,
-    ahead: L::I,
-    last: L::I,
-) -> L::I {
-    let (zero, one) = (L::I::splat(0), L::I::splat(1));
-    let index = (start + u * rate).truncate().max(zero).min(last);
-    let back = one - ahead;
-    let step = ahead - back;
-    let left = ((L::D::from_ints(index + ahead) - start) * inverse).le(u);
-    let ahead_of = u.lt((L::D::from_ints(index + back) - start) * inverse);
-    let later = L::I::select(left, index + step, index);
-    let index = L::I::select(ahead_of & !left, index - step, later);
-    index.max(zero).min(last)
+fn cell_at<L: Lanes>(position: L::D, slack: L::D, ahead: L::M, last: L::I) -> L::I {
+    let behind = L::D::select(ahead, position - slack, position + slack);
+    behind.truncate().max(L::I::splat(0)).min(last)
+}
+
+/// The further of two cells along rays.
+#[inline(always)]
+fn further<L: Lanes>(a: L::I, b: L::I, ahead: L::M) -> L::I {
+    L::I::select(ahead, a.max(b), a.min(b))
 }

@@ -28,7 +28,7 @@ pub(super) struct Spans<L: Lanes> {
 
 /// The sphere as the camera sees it.
 #[derive(Clone, Copy)]
-pub(super) struct Globe {
+pub(crate) struct Globe {
     pub eye_z: f64,
     /// 1 / effective radius, per metre.
     pub curvature: f64,
@@ -37,19 +37,24 @@ pub(super) struct Globe {
 }
 
 impl Globe {
-    pub(super) fn new(ground: &Ground, eye_z: f64) -> Self {
+    pub(crate) fn new(ground: &Ground, eye_z: f64) -> Self {
         Globe { eye_z, curvature: ground.curvature(), span_u: ground.span_u() }
     }
 
     #[inline(always)]
     fn height<L: Lanes>(&self, rise: &Rise<L>, u: L::D) -> L::D {
-        let k = L::D::splat(self.curvature);
         let across_squared = rise.across * (u * u);
+        L::D::splat(self.eye_z) + self.rise::<L>(across_squared, rise.up * u)
+    }
+
+    /// `Ground::rise` from the height of the camera.
+    #[inline(always)]
+    pub(crate) fn rise<L: Lanes>(&self, across_squared: L::D, rise: L::D) -> L::D {
+        let k = L::D::splat(self.curvature);
         let (sinc, versine) = sinc_versine::<L>(across_squared * k * k);
-        let lift = rise.up * u * k * sinc;
+        let lift = rise * k * sinc;
         let radius = L::D::splat(1.0 / self.curvature + self.eye_z);
-        let share = L::D::splat(1.0) - versine - lift;
-        L::D::splat(self.eye_z) + (radius * (lift + versine)).div(share)
+        (radius * (lift + versine)).div(L::D::splat(1.0) - versine - lift)
     }
 
     /// The spans that hold a parameter; the later one at a common end. Also where there
@@ -84,17 +89,6 @@ impl Globe {
         let bend = (L::D::splat(2.0) * end - L::D::splat(4.0) * middle).div(length * length);
         let slope = (L::D::splat(4.0) * middle - end).div(length);
         Spans { number, start_u, end_u, start_z, end_z, slope, bend }
-    }
-
-    /// Straight distance in space from the camera to points of rays.
-    #[inline(always)]
-    pub(super) fn distance<L: Lanes>(&self, rise: &Rise<L>, u: L::D, z: L::D) -> L::D {
-        let k = L::D::splat(self.curvature);
-        let (_, versine) = sinc_versine::<L>(rise.across * (u * k) * (u * k));
-        let r0 = L::D::splat(2.0 * (1.0 / self.curvature + self.eye_z));
-        let r1 = L::D::splat(1.0 / self.curvature) + z;
-        let drop = z - L::D::splat(self.eye_z);
-        (drop * drop + r0 * r1 * versine).sqrt()
     }
 }
 

@@ -7,8 +7,8 @@ use super::tiles::Tiles;
 use crate::field::{Contact, Cursor, Field, Ground, Outcome, corners_in, tile_key};
 use crate::grid::cells_of;
 use crate::lanes::{self, Width};
-use crate::path::{self, Path};
 use crate::painter::{Caster, path};
+use crate::path::{self, Path};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Method;
@@ -114,7 +114,8 @@ impl<'a> Many<'a> {
         }
         if let Outcome::Hit(contact) = &outcome {
             self.rays.part_mut(Part::U)[ray] = contact.u;
-            self.rays.part_mut(Part::Distance)[ray] = path.distance(contact.u, contact.z);
+            let along_axis = path.direction.dot(self.camera.forward);
+            self.rays.part_mut(Part::InverseDepth)[ray] = 1.0 / (contact.u * along_axis);
         }
         self.outcomes[ray] = outcome;
     }
@@ -141,15 +142,7 @@ impl<'a> Many<'a> {
     /// One over the depth of what a ray met, per metre; see [`crate::Depths`].
     #[inline]
     pub(crate) fn inverse_depth(&self, ray: usize) -> Option<f32> {
-        let along_axis = self.direction(ray).dot(self.camera.forward);
-        (self.is_hit(ray)?).then(|| (1.0 / (self.parameter(ray) * along_axis)) as f32)
-    }
-
-    /// Straight distance to what a ray met, metres.
-    #[inline]
-    pub(crate) fn distance(&self, ray: usize) -> f64 {
-        let flat = self.ground.curvature() == 0.0;
-        self.rays.part(if flat { Part::U } else { Part::Distance })[ray]
+        self.is_hit(ray)?.then(|| self.rays.part(Part::InverseDepth)[ray] as f32)
     }
 
     /// Whether a ray met the surface; `None` if it cannot be told for want of a tile.
@@ -204,10 +197,16 @@ impl<'a> Layer<'a> {
         }
         let scale = layer.spacing.map(|spacing| 1.0 / spacing);
         let eye = camera.position;
+        let start = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
+        let slack = [0, 1].map(|axis| {
+            let largest = 1.0 + start[axis].abs() + f64::from(cells[axis]);
+            16.0 * f64::EPSILON * largest
+        });
         let sight = Sight {
             camera,
             globe: (ground.curvature() != 0.0).then(|| Globe::new(ground, eye.z)),
-            start: [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]),
+            start,
+            slack,
             scale,
             cells,
             highest: field.pyramid.highest(),

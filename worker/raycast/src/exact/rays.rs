@@ -41,11 +41,11 @@ pub(super) enum Part {
     EndZ,
     Slope,
     Bend,
-    /// Straight distance to the contact, metres.
-    Distance,
+    /// One over the depth of the contact, per metre.
+    InverseDepth,
 }
 
-const PARTS: usize = Part::Distance as usize + 1;
+const PARTS: usize = Part::InverseDepth as usize + 1;
 
 /// What became of a ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

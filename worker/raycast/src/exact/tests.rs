@@ -4,15 +4,13 @@ use super::{Exact, Many};
 use crate::field::{Contact, Field, Outcome};
 use crate::lanes::Width;
 use crate::oracle::{Dice, Land, lands};
-use crate::path::Ground;
 use crate::painter::path;
-use crate::tests_support::{Plan, keys, mountains, noise, store};
-use crate::{Missing, Pyramid, View, depths, render};
+use crate::path::Ground;
+use crate::tests_support::{Plan, mountains, noise};
 use glam::DVec3;
 use std::collections::BTreeSet;
 use terrafarm_common::camera::Camera;
-use terrafarm_common::quality::{Method, Quality};
-use terrafarm_common::region::Region;
+use terrafarm_common::quality::Method;
 use terrafarm_common::shading::Earth;
 
 const SIZE: (u32, u32) = (64, 40);
@@ -29,7 +27,9 @@ fn more_lands() -> Vec<Land> {
     let hills = |i, j| 300.0 + mountains(i, j, 128, 80.0, 4);
     let quarters = |i: u64, j: u64| (hills(i, j) * 4.0).round() / 4.0;
     let holed = |i: u64, j: u64| {
-        let hole = i.wrapping_mul(i) % 61 < 2 || (i + j) % 83 == 0 || (i / 256, j / 256) == (1, 0);
+        let hole = i.wrapping_mul(i) % 61 < 2
+            || (i + j).is_multiple_of(83)
+            || (i / 256, j / 256) == (1, 0);
         if hole { f32::NAN } else { quarters(i, j) }
     };
     let one = |plan| vec![plan];
@@ -38,7 +38,10 @@ fn more_lands() -> Vec<Land> {
         Land::new("codes", one(Plan::heights([1e6, -3e6], [10.0, 7.0], [530, 700], quarters))),
         Land::new("holes", one(Plan::heights([0.0; 2], [0.3, 0.4], [771, 300], holed))),
         Land::new("one cell", one(Plan::heights([0.0; 2], [5.0; 2], [2, 2], quarters))),
-        Land::new("rough", one(Plan::heights([0.0; 2], [1.0; 2], [300, 40], |i, j| 9.0 * noise(i, j, 3)))),
+        Land::new(
+            "rough",
+            one(Plan::heights([0.0; 2], [1.0; 2], [300, 40], |i, j| 9.0 * noise(i, j, 3))),
+        ),
     ]
 }
 
@@ -118,8 +121,9 @@ fn every_width_finds_the_same_bits_as_the_slow_twin() {
                     assert_eq!(bits(&found), bits(truth), "{}", what());
                     let (path, _) = many.path(ray);
                     if let Outcome::Hit(contact) = &found {
-                        let distance = path.distance(contact.u, contact.z);
-                        assert_eq!(many.distance(ray).to_bits(), distance.to_bits(), "{}", what());
+                        let depth = contact.u * path.direction.dot(camera.forward);
+                        let inverse = (1.0 / depth) as f32;
+                        assert_eq!(many.inverse_depth(ray), Some(inverse), "{}", what());
                         hits += 1;
                     } else {
                         misses += 1;
@@ -131,4 +135,48 @@ fn every_width_finds_the_same_bits_as_the_slow_twin() {
     }
     println!("{hits} hits, {misses} misses: all the same");
     assert!(hits > 100_000 && misses > 50_000, "{hits} hits, {misses} misses");
+}
+
+#[test]
+fn every_width_waits_for_the_same_tiles_as_the_slow_twin() {
+    let (mut unfinished, mut finished) = (0, 0);
+    for (number, land) in lands().into_iter().chain(more_lands()).enumerate() {
+        let mut dice = Dice::new(99 + 1000 * number as u64);
+        for _ in 0..crate::oracle::count(8) {
+            let mut resident = land.resident.clone();
+            let loaded: Vec<_> = land.resident.loaded().collect();
+            for key in loaded.into_iter().filter(|_| dice.below(3) == 0) {
+                resident.remove(key);
+            }
+            let field = Field { resident: &resident, pyramid: &land.pyramid };
+            let camera = camera(&land, &mut dice);
+            let ground = Ground::new(earth(&mut dice));
+            let places: Vec<[f64; 2]> = (0..200)
+                .map(|_| [f64::from(SIZE.0), f64::from(SIZE.1)].map(|size| size * dice.unit()))
+                .collect();
+            let mut exact = Exact::new(field);
+            let truths: Vec<Outcome> = places
+                .iter()
+                .map(|&place| exact.cast(&path(&camera, ground, place, 0.0).0, 0.0))
+                .collect();
+            let mut expected = BTreeSet::new();
+            exact.wanted.drain_into(&mut expected);
+            for width in Width::available() {
+                let mut many = Many::new(field, &camera, ground, Method::Exact, width);
+                places.iter().for_each(|&place| many.push(place, 0.0));
+                many.cast();
+                for (ray, truth) in truths.iter().enumerate() {
+                    let found = many.outcome(ray);
+                    assert_eq!(bits(&found), bits(truth), "{} {width:?} {camera:?}", land.name);
+                    let open = matches!(truth, Outcome::Unfinished);
+                    assert_eq!(matches!(found, Outcome::Unfinished), open, "{}", land.name);
+                    if open { unfinished += 1 } else { finished += 1 }
+                }
+                let mut missing = BTreeSet::new();
+                many.slow.finish(&mut missing);
+                assert_eq!(missing, expected, "{} {width:?} {camera:?}", land.name);
+            }
+        }
+    }
+    assert!(unfinished > 5_000 && finished > 20_000, "{unfinished} unfinished, {finished} not");
 }

@@ -13,7 +13,7 @@ const SLOTS: usize = 64;
 const NONE: i32 = -1;
 
 /// Looks tiles of level 0 of one layer up and remembers them.
-pub(super) struct Tiles<'a> {
+pub(crate) struct Tiles<'a> {
     field: Field<'a>,
     layer: usize,
     /// Tiles along x.
@@ -28,11 +28,16 @@ pub(super) struct Tiles<'a> {
 enum Soil<'a> {
     Codes(Codes<'a>),
     /// Heights as they are, as bits.
-    Floats { posts: &'a [u32], maxima: &'a [u32] },
+    Floats {
+        posts: &'a [u32],
+        maxima: &'a [u32],
+    },
     /// No surface at all.
     Void,
-    /// It is not loaded.
-    Absent,
+    /// It is not loaded; the index knows its maximum.
+    Absent {
+        highest: f32,
+    },
 }
 
 /// The corners of cells.
@@ -46,10 +51,10 @@ pub(super) struct Corners<L: Lanes> {
 }
 
 impl<'a> Tiles<'a> {
-    pub(super) fn new(field: Field<'a>, layer: usize) -> Self {
+    pub(crate) fn new(field: Field<'a>, layer: usize) -> Self {
         let levels = &field.index().layers[layer].levels;
         let columns = levels.first().map_or(0, |level| level.tiles[0] as i32);
-        let none = (NONE, Soil::Absent);
+        let none = (NONE, Soil::Void);
         Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none }
     }
 
@@ -75,7 +80,10 @@ impl<'a> Tiles<'a> {
                 }
             },
             Ground::Void => Soil::Void,
-            Ground::Absent => Soil::Absent,
+            Ground::Absent => {
+                let entry = self.field.index().entry(key);
+                Soil::Absent { highest: entry.map_or(f32::INFINITY, |entry| entry.max) }
+            }
         };
         self.last = (number, soil);
         self.slots[number as usize % SLOTS] = self.last;
@@ -102,9 +110,9 @@ impl<'a> Tiles<'a> {
     }
 
     /// Maxima over blocks of `1 << level` cells, metres, for `lanes`: -infinity where no
-    /// cell has a surface. Also the lanes whose tile is not loaded.
+    /// cell has a surface, that of the whole tile where it is not loaded. Also these lanes.
     #[inline(always)]
-    pub(super) fn maxima<L: Lanes>(
+    pub(crate) fn maxima<L: Lanes>(
         &mut self,
         cell: [L::I; 2],
         level: L::I,
@@ -127,7 +135,10 @@ impl<'a> Tiles<'a> {
                     highest = L::D::select(here, read_float::<L>(maxima, at, here), highest);
                 }
                 Soil::Void => {}
-                Soil::Absent => absent = absent | here,
+                Soil::Absent { highest: all } => {
+                    highest = L::D::select(here, L::D::splat(f64::from(all)), highest);
+                    absent = absent | here;
+                }
             }
             rest = rest & !here;
         }
@@ -141,8 +152,7 @@ impl<'a> Tiles<'a> {
         let north = at + L::I::splat(TILE_POSTS as i32);
         let numbers = self.numbers::<L>(cell);
         let none = L::D::splat(0.0);
-        let mut corners =
-            Corners { heights: [none; 4], solid: L::M::none(), absent: L::M::none() };
+        let mut corners = Corners { heights: [none; 4], solid: L::M::none(), absent: L::M::none() };
         let mut rest = lanes;
         while rest.any() {
             let here = self.alike::<L>(numbers, rest);
@@ -182,7 +192,7 @@ impl<'a> Tiles<'a> {
                     }
                 }
                 Soil::Void => {}
-                Soil::Absent => corners.absent = corners.absent | here,
+                Soil::Absent { .. } => corners.absent = corners.absent | here,
             }
             rest = rest & !here;
         }

@@ -48,10 +48,8 @@ impl M {
     fn of_halves(low: __m256d, high: __m256d) -> M {
         // SAFETY: see the page of this module.
         unsafe {
-            let even = _mm256_shuffle_ps::<0b10_00_10_00>(
-                _mm256_castpd_ps(low),
-                _mm256_castpd_ps(high),
-            );
+            let even =
+                _mm256_shuffle_ps::<0b10_00_10_00>(_mm256_castpd_ps(low), _mm256_castpd_ps(high));
             M(_mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(even))))
         }
     }
@@ -199,10 +197,7 @@ impl Doubles for D {
     fn to_single(self) -> D {
         // SAFETY: see the page of this module.
         unsafe {
-            D(
-                _mm256_cvtps_pd(_mm256_cvtpd_ps(self.0)),
-                _mm256_cvtps_pd(_mm256_cvtpd_ps(self.1)),
-            )
+            D(_mm256_cvtps_pd(_mm256_cvtpd_ps(self.0)), _mm256_cvtps_pd(_mm256_cvtpd_ps(self.1)))
         }
     }
 }

@@ -157,10 +157,7 @@ impl Doubles for D {
     fn to_single(self) -> D {
         // SAFETY: see the page of this module.
         unsafe {
-            D(
-                _mm512_cvtps_pd(_mm512_cvtpd_ps(self.0)),
-                _mm512_cvtps_pd(_mm512_cvtpd_ps(self.1)),
-            )
+            D(_mm512_cvtps_pd(_mm512_cvtpd_ps(self.0)), _mm512_cvtps_pd(_mm512_cvtpd_ps(self.1)))
         }
     }
 }
