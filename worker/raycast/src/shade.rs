@@ -30,7 +30,7 @@ use crate::{Pyramid, View, srgb};
 use air::Air;
 use footprint::Footprint;
 use glam::DVec3;
-use ray::{End, Lens, Ray};
+use ray::{Lens, Ray};
 use sheets::Sheets;
 use std::collections::BTreeSet;
 use terrafarm_common::camera::Camera;
@@ -157,48 +157,138 @@ impl<'a> Shader<'a> {
         lanes::run(Run { shader: self, places, light }, width);
     }
 
+    /// Shades [`AT_ONCE`] places at most. Every step is done for all of them before the
+    /// next is: within a step nothing waits for anything, while the steps of one place are
+    /// a long chain.
     #[inline(always)]
-    fn places<L: Lanes>(&mut self, x: L::F, y: L::F, s: L::F) -> [L::F; 3] {
-        let ray = Ray::<L>::new(&self.lens, x, y);
+    fn places<L: Lanes>(&mut self, batch: &mut Batch) {
+        let vectors = batch.count.div_ceil(L::N);
+        for n in 0..vectors {
+            self.rays::<L>(batch, n);
+        }
+        for n in 0..vectors {
+            self.slopes::<L>(batch, n);
+        }
+        for n in 0..vectors {
+            self.photos::<L>(batch, n);
+        }
+        for n in 0..vectors {
+            self.colors::<L>(batch, n);
+        }
+    }
+
+    /// Where rays go and end.
+    #[inline(always)]
+    fn rays<L: Lanes>(&self, batch: &mut Batch, n: usize) {
+        let at = n * L::N;
+        let (x, y) = (L::F::load(&batch.x[at..]), L::F::load(&batch.y[at..]));
+        let s = L::F::load(&batch.s[at..]);
         let ground = s.le(L::F::splat(f32::MAX));
-        let sky = L::F::splat(f32::MAX).lt(s);
-        let none = L::F::splat(f32::NAN);
-        let mut color = [none; 3];
+        batch.ground[n] = ground.bits();
+        batch.sky[n] = L::F::splat(f32::MAX).lt(s).bits();
+        let ray = Ray::<L>::new(&self.lens, x, y);
+        for part in 0..3 {
+            ray.view[part].store(&mut batch.view[part][at..]);
+        }
         if ground.any() {
             let end = ray.end(&self.lens, L::F::select(ground, s, L::F::splat(1.0)));
-            let (lit, unsure) = self.ground::<L>(&end, ground);
-            let seen = self.air.veil(lit, &ray, end.distance, end.over);
+            end.along[0].store(&mut batch.along[0][at..]);
+            end.along[1].store(&mut batch.along[1][at..]);
+            end.over.store(&mut batch.over[at..]);
+            end.distance.store(&mut batch.distance[at..]);
+            end.falls.store(&mut batch.falls[at..]);
+            let size = end.depth * L::F::splat(self.sample_tangent);
+            size.store(&mut batch.size[at..]);
+        }
+    }
+
+    /// Slopes of the ground.
+    #[inline(always)]
+    fn slopes<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
+        let at = n * L::N;
+        let ground = L::M::from_bits(batch.ground[n]);
+        if !ground.any() {
+            return;
+        }
+        let size = L::F::load(&batch.size[at..]);
+        let along = batch.along::<L>(at);
+        let found =
+            slope::slopes::<L>(&mut self.heights, along, size, ground, &mut self.wanted);
+        found.slopes[0].store(&mut batch.slopes[0][at..]);
+        found.slopes[1].store(&mut batch.slopes[1][at..]);
+        batch.unsure[n] = found.unsure.bits();
+    }
+
+    /// What the photos show, in sunlight.
+    #[inline(always)]
+    fn photos<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
+        let at = n * L::N;
+        let ground = L::M::from_bits(batch.ground[n]);
+        if !ground.any() {
+            return;
+        }
+        let mut color = [L::F::splat(0.0); 3];
+        let mut covered = L::F::splat(0.0);
+        if !self.photos.is_empty() {
+            let size = L::F::load(&batch.size[at..]);
+            let sides = [self.lens.right, self.lens.up];
+            let [x, y, z] = batch.view::<L>(at);
+            let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
+            let slopes = batch.slopes::<L>(at);
+            let footprint = Footprint::<L>::new(sides, size, arriving, slopes);
+            let along = batch.along::<L>(at);
+            let wanted = &mut self.wanted;
+            let photo = photo::sample::<L>(&mut self.photos, along, &footprint, ground, wanted);
+            (color, covered) = (photo.light, photo.coverage);
+            batch.unsure[n] |= photo.unsure.bits();
+        }
+        for c in 0..3 {
+            color[c].store(&mut batch.light[c][at..]);
+        }
+        covered.store(&mut batch.covered[at..]);
+    }
+
+    /// The light that comes in.
+    #[inline(always)]
+    fn colors<L: Lanes>(&self, batch: &mut Batch, n: usize) {
+        let at = n * L::N;
+        let ray = batch.view::<L>(at);
+        let none = L::F::splat(f32::NAN);
+        let mut color = [none; 3];
+        let ground = L::M::from_bits(batch.ground[n]);
+        if ground.any() {
+            let over = L::F::load(&batch.over[at..]);
+            let lit = self.ground::<L>(batch, at, over);
+            let distance = L::F::load(&batch.distance[at..]);
+            let seen = self.air.veil::<L>(lit, ray, distance, over);
+            let sure = ground & !L::M::from_bits(batch.unsure[n]);
             for c in 0..3 {
-                color[c] = L::F::select(ground & !unsure, seen[c], none);
+                color[c] = L::F::select(sure, seen[c], none);
             }
         }
+        let sky = L::M::from_bits(batch.sky[n]);
         if sky.any() {
-            let seen = self.air.sky(&ray);
+            let seen = self.air.sky::<L>(ray);
             for c in 0..3 {
                 color[c] = L::F::select(sky, seen[c], color[c]);
             }
         }
-        color
+        for c in 0..3 {
+            color[c].store(&mut batch.light[c][at..]);
+        }
     }
 
-    /// Light from the ground, and where a tile is missing.
+    /// Photo, and tint where there is none, in sunlight.
     #[inline(always)]
-    fn ground<L: Lanes>(&mut self, end: &End<L>, lanes: L::M) -> ([L::F; 3], L::M) {
-        let size_m = end.depth * L::F::splat(self.sample_tangent);
-        let wanted = &mut self.wanted;
-        let slopes = slope::slopes::<L>(&mut self.heights, end.along, size_m, lanes, wanted);
-        let mut unsure = slopes.unsure;
-        let slopes = slopes.slopes;
-        let mut color = [L::F::splat(0.0); 3];
-        let mut covered = L::F::splat(0.0);
-        if !self.photos.is_empty() {
-            let sides = [self.lens.right, self.lens.up];
-            let footprint = Footprint::<L>::new(sides, size_m, end.view, slopes);
-            let photo = photo::sample::<L>(&mut self.photos, end.along, &footprint, lanes, wanted);
-            (color, covered) = (photo.light, photo.coverage);
-            unsure = unsure | photo.unsure;
-        }
-        let open = lanes & covered.lt(L::F::splat(COVERED));
+    fn ground<L: Lanes>(&self, batch: &Batch, at: usize, over: L::F) -> [L::F; 3] {
+        let mut color = [
+            L::F::load(&batch.light[0][at..]),
+            L::F::load(&batch.light[1][at..]),
+            L::F::load(&batch.light[2][at..]),
+        ];
+        let slopes = batch.slopes::<L>(at);
+        let covered = L::F::load(&batch.covered[at..]);
+        let open = covered.lt(L::F::splat(COVERED));
         if open.any() {
             let bare = match self.bare_ground {
                 Some(color) => [
@@ -206,11 +296,12 @@ impl<'a> Shader<'a> {
                     L::F::splat(color[1]),
                     L::F::splat(color[2]),
                 ],
-                None => tint::tint::<L>(L::F::splat(self.lens.eye_z) + end.over, slopes),
+                None => tint::tint::<L>(L::F::splat(self.lens.eye_z) + over, slopes),
             };
-            let uncovered = (L::F::splat(1.0) - covered).max(L::F::splat(0.0));
+            let uncovered = L::F::splat(1.0) - covered;
+            let uncovered = L::F::select(open, uncovered, L::F::splat(0.0));
             for c in 0..3 {
-                color[c] = color[c] + L::F::select(open, uncovered * bare[c], L::F::splat(0.0));
+                color[c] = color[c] + uncovered * bare[c];
             }
         }
         if let Some(sun) = &self.sun {
@@ -219,7 +310,85 @@ impl<'a> Shader<'a> {
                 *channel = *channel * light;
             }
         }
-        (color, unsure)
+        color
+    }
+}
+
+/// Places that are shaded at once; a multiple of all numbers of lanes.
+const AT_ONCE: usize = 128;
+/// Vectors of them, at most.
+const VECTORS: usize = AT_ONCE;
+
+/// Some places on their way from step to step. Masks are bits, one word a vector.
+struct Batch {
+    count: usize,
+    x: [f32; AT_ONCE],
+    y: [f32; AT_ONCE],
+    s: [f32; AT_ONCE],
+    ground: [u32; VECTORS],
+    sky: [u32; VECTORS],
+    unsure: [u32; VECTORS],
+    view: [[f32; AT_ONCE]; 3],
+    along: [[f32; AT_ONCE]; 2],
+    over: [f32; AT_ONCE],
+    distance: [f32; AT_ONCE],
+    falls: [f32; AT_ONCE],
+    size: [f32; AT_ONCE],
+    slopes: [[f32; AT_ONCE]; 2],
+    light: [[f32; AT_ONCE]; 3],
+    covered: [f32; AT_ONCE],
+}
+
+impl Batch {
+    fn new() -> Self {
+        let none = [0.0; AT_ONCE];
+        Batch {
+            count: 0,
+            x: none,
+            y: none,
+            s: none,
+            ground: [0; VECTORS],
+            sky: [0; VECTORS],
+            unsure: [0; VECTORS],
+            view: [none; 3],
+            along: [none; 2],
+            over: none,
+            distance: none,
+            falls: none,
+            size: none,
+            slopes: [none; 2],
+            light: [none; 3],
+            covered: none,
+        }
+    }
+
+    /// Takes the places from `at` on, as many as fit. Those that fill the last vector up
+    /// need nothing.
+    #[inline(always)]
+    fn fill(&mut self, places: Places, at: usize) {
+        self.count = AT_ONCE.min(places.s.len() - at);
+        let end = at + self.count;
+        self.x[..self.count].copy_from_slice(&places.x[at..end]);
+        self.y[..self.count].copy_from_slice(&places.y[at..end]);
+        self.s[..self.count].copy_from_slice(&places.s[at..end]);
+        let last = (self.count + MOST).min(AT_ONCE);
+        self.s[self.count..last].fill(f32::NAN);
+    }
+
+    #[inline(always)]
+    fn view<L: Lanes>(&self, at: usize) -> [L::F; 3] {
+        let [x, y, z] = &self.view;
+        [L::F::load(&x[at..]), L::F::load(&y[at..]), L::F::load(&z[at..])]
+    }
+
+    #[inline(always)]
+    fn along<L: Lanes>(&self, at: usize) -> [L::F; 2] {
+        [L::F::load(&self.along[0][at..]), L::F::load(&self.along[1][at..])]
+    }
+
+    #[inline(always)]
+    fn slopes<L: Lanes>(&self, at: usize) -> [L::F; 2] {
+        [L::F::load(&self.slopes[0][at..]), L::F::load(&self.slopes[1][at..])]
     }
 }
 
@@ -235,31 +404,15 @@ impl Kernel for Run<'_, '_, '_> {
 
     #[inline(always)]
     fn run<L: Lanes>(self) {
-        let Run { shader, places: Places { x, y, s }, light } = self;
+        let Run { shader, places, light } = self;
+        let mut batch = Batch::new();
         let mut at = 0;
-        while at < s.len() {
-            let count = L::N.min(s.len() - at);
-            let whole = count == L::N;
-            // At the end, with places beside it that need nothing.
-            let mut part = [[0.0f32; MOST], [0.0; MOST], [f32::NAN; MOST]];
-            if !whole {
-                for (part, all) in part.iter_mut().zip([x, y, s]) {
-                    part[..count].copy_from_slice(&all[at..at + count]);
-                }
-            }
-            let [x, y, s] = if whole {
-                [&x[at..], &y[at..], &s[at..]]
-            } else {
-                [&part[0][..], &part[1][..], &part[2][..]]
-            };
-            let color = shader.places::<L>(L::F::load(x), L::F::load(y), L::F::load(s));
+        while at < places.s.len() {
+            batch.fill(places, at);
+            shader.places::<L>(&mut batch);
+            let count = batch.count;
             for c in 0..3 {
-                if whole {
-                    color[c].store(&mut light[c][at..]);
-                } else {
-                    color[c].store(&mut part[0]);
-                    light[c][at..at + count].copy_from_slice(&part[0][..count]);
-                }
+                light[c][at..at + count].copy_from_slice(&batch.light[c][..count]);
             }
             at += count;
         }

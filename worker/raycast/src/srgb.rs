@@ -1,49 +1,23 @@
 //! From linear light to the bytes of a picture, the same on every PC.
 //!
-//! The sRGB curve is never evaluated per pixel: a table holds the light at which each
-//! byte gives way to the next, made once with a software power function.
+//! The power of the sRGB curve (IEC 61966-2-1) is a polynomial in the fourth root of
+//! light, off by at most 0.011 of a byte.
 
-use crate::lanes::{self, Floats, Ints, Kernel, Lanes, MOST, Mask, One, Width};
-use std::sync::LazyLock;
+use crate::lanes::{self, Floats, Ints, Kernel, Lanes, MOST, One, Width};
 use terrafarm_common::shading::LinearRgb;
 
-/// Entries of the table, over the square root of light: so many that none holds more than
-/// one step from a byte to the next.
-const ENTRIES: usize = 1024;
-/// The bits of an entry that are its byte.
-const BYTE: u32 = 0xFF;
-
-/// By entry the byte of its least light, and in the upper bits the light from which on it
-/// is one more: an f32 to 16 bits, which moves a step by at most 0.002 of a byte.
-static TABLE: LazyLock<Box<[u32]>> = LazyLock::new(|| {
-    let mut steps = (0..255u8).map(|byte| {
-        let light = decode((f64::from(byte) + 0.5) / 255.0) as f32;
-        f32::from_bits((light.to_bits() + BYTE / 2 + 1) & !BYTE)
-    });
-    let mut next = steps.next();
-    let mut byte = 0;
-    let entries = (0..=ENTRIES).map(|entry| match next {
-        Some(step) if (step.sqrt() * ENTRIES as f32) as usize <= entry => {
-            next = steps.next();
-            byte += 1;
-            step.to_bits() | (byte - 1)
-        }
-        // More than any light.
-        _ => 2.0f32.to_bits() | byte,
-    });
-    entries.collect()
-});
-
-/// Light of an sRGB value, both 0 to 1 (IEC 61966-2-1).
-fn decode(value: f64) -> f64 {
-    if value <= 0.04045 { value / 12.92 } else { libm::pow((value + 0.055) / 1.055, 2.4) }
-}
+/// Light up to which the curve is a line, and the line's steepness.
+const LINE_END: f32 = 0.003_130_8;
+const LINE: f32 = 12.92 * 255.0;
+/// The curve above, in bytes: 255 (1.055 y^(5/3) - 0.055) for y from 0.2365 to 1, by
+/// interpolation at the Chebyshev nodes.
+const CURVE: [f32; 5] = [-16.535_164, 50.500_4, 284.923_5, -83.989_83, 20.108_229];
 
 /// The bytes of a colour; what is too bright or too dark is cut off.
 pub(crate) fn encode(color: LinearRgb) -> [u8; 3] {
     color.map(|light| {
         let mut byte = [0];
-        bytes::<One>(&TABLE, Floats::splat(light)).store(&mut byte);
+        bytes::<One>(Floats::splat(light)).store(&mut byte);
         byte[0] as u8
     })
 }
@@ -63,7 +37,6 @@ impl Kernel for Encode<'_> {
 
     #[inline(always)]
     fn run<L: Lanes>(self) {
-        let table = &**TABLE;
         let [red, green, blue] = self.light;
         let mut colors = [0i32; MOST];
         for (n, pixels) in self.pixels.chunks_mut(3 * L::N).enumerate() {
@@ -78,9 +51,9 @@ impl Kernel for Encode<'_> {
                 }
                 [L::F::load(&part[0]), L::F::load(&part[1]), L::F::load(&part[2])]
             };
-            let color = bytes::<L>(table, r)
-                + bytes::<L>(table, g).shl(L::I::splat(8))
-                + bytes::<L>(table, b).shl(L::I::splat(16));
+            let color = bytes::<L>(r)
+                + bytes::<L>(g).shl(L::I::splat(8))
+                + bytes::<L>(b).shl(L::I::splat(16));
             color.store(&mut colors);
             for (pixel, color) in pixels.chunks_exact_mut(3).zip(&colors) {
                 let [red, green, blue, _] = color.to_le_bytes();
@@ -91,18 +64,27 @@ impl Kernel for Encode<'_> {
 }
 
 #[inline(always)]
-fn bytes<L: Lanes>(table: &[u32], light: L::F) -> L::I {
+fn bytes<L: Lanes>(light: L::F) -> L::I {
     let light = light.max(L::F::splat(0.0)).min(L::F::splat(1.0));
-    let entry = (light.sqrt() * L::F::splat(ENTRIES as f32)).truncate();
-    let found = L::I::gather(table, entry, !L::M::none());
-    let step = L::F::from_bits(found & L::I::splat(!BYTE as i32));
-    let one_more = L::I::select(step.le(light), L::I::splat(1), L::I::splat(0));
-    (found & L::I::splat(BYTE as i32)) + one_more
+    let y = light.sqrt().sqrt();
+    let square = y * y;
+    let [a, b, c, d, e] = CURVE;
+    let low = L::F::splat(a) + L::F::splat(b) * y;
+    let high = L::F::splat(c) + L::F::splat(d) * y + L::F::splat(e) * square;
+    let curve = low + high * square;
+    let line = light * L::F::splat(LINE);
+    let value = L::F::select(light.le(L::F::splat(LINE_END)), line, curve);
+    (value + L::F::splat(0.5)).truncate()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Light of an sRGB value, both 0 to 1.
+    fn decode(value: f64) -> f64 {
+        if value <= 0.04045 { value / 12.92 } else { libm::pow((value + 0.055) / 1.055, 2.4) }
+    }
 
     #[test]
     fn every_byte_comes_back_and_nothing_else_breaks_it() {
@@ -130,7 +112,7 @@ mod tests {
                 };
                 s * 255.0
             };
-            assert!((exact - f64::from(byte)).abs() < 0.502, "{light}: {byte} for {exact}");
+            assert!((exact - f64::from(byte)).abs() < 0.511, "{light}: {byte} for {exact}");
             last = byte;
         }
     }

@@ -1,7 +1,6 @@
 //! Haze between the camera and the ground, and the sky behind.
 
 use super::exp::exp;
-use super::ray::Ray;
 use super::slope::lerp;
 use crate::lanes::{Floats, Lanes};
 use terrafarm_common::shading::{LinearRgb, Shading};
@@ -74,7 +73,7 @@ impl Air {
     pub(crate) fn veil<L: Lanes>(
         &self,
         ground: [L::F; 3],
-        ray: &Ray<L>,
+        view: [L::F; 3],
         distance_m: L::F,
         over: L::F,
     ) -> [L::F; 3] {
@@ -90,13 +89,14 @@ impl Air {
             let x = rise.abs();
             let fall = exp::<L>(-x);
             let long = (one - fall).div(x);
-            let series = one - x * (L::F::splat(0.5)
-                - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
+            let series = one
+                - x * (L::F::splat(0.5)
+                    - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
             let mean = L::F::select(x.lt(L::F::splat(FLAT_WAY)), series, long);
             depth = depth * L::F::select(rise.lt(zero), mean.div(fall), mean);
         }
         let clear = exp::<L>(depth);
-        let glow = self.glow(ray);
+        let glow = self.glow::<L>(view);
         let mut veiled = ground;
         for c in 0..3 {
             let air = L::F::splat(haze.color[c]) + glow * L::F::splat(SUN_COLOR[c]);
@@ -107,17 +107,17 @@ impl Air {
 
     /// The sky in a direction. Below the horizon it is what the horizon is.
     #[inline(always)]
-    pub(crate) fn sky<L: Lanes>(&self, ray: &Ray<L>) -> [L::F; 3] {
+    pub(crate) fn sky<L: Lanes>(&self, view: [L::F; 3]) -> [L::F; 3] {
         let zero = L::F::splat(0.0);
-        let sine = ray.view[2].max(zero);
+        let sine = view[2].max(zero);
         let up = sine.sqrt();
         let mut clear = L::F::splat(1.0);
         if let Some(haze) = &self.haze {
             let depth = L::F::splat(-haze.layer).div(sine + L::F::splat(HORIZON_SINE));
             // Just below the horizon all is haze, just above it nearly so.
-            clear = L::F::select(zero.lt(ray.view[2]), exp::<L>(depth), zero);
+            clear = L::F::select(zero.lt(view[2]), exp::<L>(depth), zero);
         }
-        let sun = self.glow(ray) + self.disc(ray);
+        let sun = self.glow::<L>(view) + self.disc::<L>(view);
         let mut color = [zero; 3];
         for c in 0..3 {
             let bare = L::F::splat(self.horizon[c]) + L::F::splat(self.higher[c]) * up;
@@ -129,9 +129,9 @@ impl Air {
 
     /// Light scattered around the sun: a narrow and a wide glow.
     #[inline(always)]
-    fn glow<L: Lanes>(&self, ray: &Ray<L>) -> L::F {
+    fn glow<L: Lanes>(&self, view: [L::F; 3]) -> L::F {
         let Some(sun) = self.sun else { return L::F::splat(0.0) };
-        let away = away::<L>(sun, ray);
+        let away = away::<L>(sun, view);
         let one = L::F::splat(1.0);
         let [(near, steep), (wide, flat)] = GLOWS;
         let steep = one + L::F::splat(steep) * away;
@@ -140,21 +140,21 @@ impl Air {
     }
 
     #[inline(always)]
-    fn disc<L: Lanes>(&self, ray: &Ray<L>) -> L::F {
+    fn disc<L: Lanes>(&self, view: [L::F; 3]) -> L::F {
         let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
         let Some(sun) = self.sun else { return zero };
-        let edge = L::F::splat(1.25 * SUN_DISC) - away::<L>(sun, ray);
+        let edge = L::F::splat(1.25 * SUN_DISC) - away::<L>(sun, view);
         let edge = (edge * L::F::splat(2.0 / SUN_DISC)).max(zero).min(one);
         let disc = edge * edge * (L::F::splat(3.0) - edge - edge);
-        L::F::select(zero.lt(ray.view[2]), disc, zero)
+        L::F::select(zero.lt(view[2]), disc, zero)
     }
 }
 
 /// 1 - the cosine of the angle to the sun, exact also close to it.
 #[inline(always)]
-fn away<L: Lanes>(sun: [f32; 3], ray: &Ray<L>) -> L::F {
-    let x = ray.view[0] - L::F::splat(sun[0]);
-    let y = ray.view[1] - L::F::splat(sun[1]);
-    let z = ray.view[2] - L::F::splat(sun[2]);
+fn away<L: Lanes>(sun: [f32; 3], view: [L::F; 3]) -> L::F {
+    let x = view[0] - L::F::splat(sun[0]);
+    let y = view[1] - L::F::splat(sun[1]);
+    let z = view[2] - L::F::splat(sun[2]);
     (x * x + y * y + z * z) * L::F::splat(0.5)
 }

@@ -11,7 +11,7 @@ pub(crate) fn exp<L: Lanes>(x: L::F) -> L::F {
     // out is (f ln 2)^7 / 7! < 1.2e-7.
     const TERMS: [f32; 7] = [
         1.0,
-        0.693_147_2,
+        std::f32::consts::LN_2,
         0.240_226_5,
         0.055_504_11,
         0.009_618_129,

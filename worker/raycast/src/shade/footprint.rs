@@ -92,7 +92,12 @@ mod tests {
     use crate::lanes::{Mask, One};
 
     /// Along x, length, slant, major, minor.
-    fn strip(sides: [[f32; 3]; 2], size: f32, view: [f32; 3], slopes: [f32; 2]) -> (bool, [f32; 4]) {
+    fn strip(
+        sides: [[f32; 3]; 2],
+        size: f32,
+        view: [f32; 3],
+        slopes: [f32; 2],
+    ) -> (bool, [f32; 4]) {
         let view = view.map(Floats::splat);
         let slopes = slopes.map(Floats::splat);
         let footprint = Footprint::<One>::new(sides, Floats::splat(size), view, slopes);
@@ -116,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_slanted_view_stretches_along_the_view_whatever_the_roll() {
-        let (sin, cos) = (0.1f32, 0.994_987_43f32);
+        let (sin, cos) = (0.1f32, 0.994_987_4f32);
         for (heading, x) in [(0.0f64, true), (0.5, true), (1.2, false), (2.0, false), (3.0, true)] {
             let (hs, hc) = (libm::sin(heading) as f32, libm::cos(heading) as f32);
             let view = [cos * hc, cos * hs, -sin];
@@ -127,8 +132,7 @@ mod tests {
                     [0, 1, 2].map(|n| a[n] * p + b[n] * q)
                 };
                 let sides = [mix(right, c, up, s), mix(up, c, right, -s)];
-                let (along_x, [length, slant, major, minor]) =
-                    strip(sides, 1.0, view, [0.0, 0.0]);
+                let (along_x, [length, slant, major, minor]) = strip(sides, 1.0, view, [0.0, 0.0]);
                 assert!((major - 10.0).abs() < 1e-4 && (minor - 1.0).abs() < 1e-4);
                 assert_eq!(along_x, x, "{heading}");
                 let (longer, shorter) = if x { (hc, hs) } else { (hs, hc) };

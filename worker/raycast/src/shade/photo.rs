@@ -11,15 +11,18 @@
 
 use super::footprint::{Footprint, Strip};
 use super::level::{Between, first, shrink};
-use super::sheets::{Sheet, Sheets, Soil, Spot};
+use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
 use super::slope::lerp;
 use crate::field::Wanted;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
 use terrafarm_terrain::layout::{TILE_POSTS, TILE_RING};
-use terrafarm_terrain::tile::{FIELDS, PhotoTile, TURNED};
+use terrafarm_terrain::tile::{FIELDS, PhotoTile, TURNED, Texels};
 
 /// The longest footprint, in its widths; longer ones take a coarser level.
 const MAX_STRETCH: f32 = 16.0;
+/// The most texels of a row. Only in the coarsest level, where a pixel covers much of the
+/// photo, are there more; those at the ends are left out.
+const LONGEST: f32 = 64.0;
 /// Coverage from which on a photo hides what lies below it.
 const OPAQUE: f32 = 0.999;
 /// How far beyond the centres of its outermost texels a photo reaches, in texels.
@@ -44,8 +47,7 @@ pub(crate) fn sample<L: Lanes>(
     wanted: &mut Wanted,
 ) -> Sample<L> {
     let zero = L::F::splat(0.0);
-    let mut sum: Sample<L> =
-        Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
+    let mut sum: Sample<L> = Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
     let mut number = layers.len();
     while number > 0 {
         number -= 1;
@@ -80,8 +82,7 @@ fn filtered<L: Lanes>(
     let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
     let width = strip.minor.max(strip.major * L::F::splat(1.0 / MAX_STRETCH));
     let between = Between::<L>::of(width, sheets.top());
-    let mut sum: Sample<L> =
-        Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
+    let mut sum: Sample<L> = Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
     let mut pass = 0;
     while pass < 2 {
         let share = if pass == 0 { one - between.share } else { between.share };
@@ -126,10 +127,24 @@ impl<L: Lanes> Row<L> {
             cell: [L::I::select(along_x, i, j), L::I::select(along_x, j, i)],
             part: [L::F::select(along_x, x, y), L::F::select(along_x, y, x)],
             slant: strip.slant,
-            // Not more than the stretch allows, also where that is no number.
-            length: length.min(L::F::splat(4.0 * MAX_STRETCH)),
+            length: length.min(L::F::splat(LONGEST)),
         }
     }
+}
+
+/// What a row is in one level of a layer: all that does not change from texel to texel.
+struct Track<L: Lanes> {
+    /// Last post and last tile along the row and across.
+    end: [L::I; 2],
+    last: [L::I; 2],
+    /// Where the copy of a tile begins whose texels lie in the order of the row.
+    copy: L::I,
+    /// Texel n reaches from n - 1/2 to n + 1/2, all relative to the middle's. This is where
+    /// the row begins and ends, plus 1/2.
+    start: L::F,
+    stop: L::F,
+    /// Weight of a whole texel.
+    scale: L::F,
 }
 
 /// Adds the mean of the texels of a row to `sum`, by its share.
@@ -143,45 +158,123 @@ fn mean<L: Lanes>(
     sum: &mut Sample<L>,
     wanted: &mut Wanted,
 ) {
-    let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-    let (none, half) = (L::I::splat(0), L::F::splat(0.5));
     let sheet = sheets.sheet(level);
     let along_x = row.along_x;
     let (x_end, y_end) = (L::I::splat(sheet.end[0]), L::I::splat(sheet.end[1]));
     let (x_last, y_last) = (L::I::splat(sheet.last_tile[0]), L::I::splat(sheet.last_tile[1]));
-    let end = [L::I::select(along_x, x_end, y_end), L::I::select(along_x, y_end, x_end)];
-    let last = [L::I::select(along_x, x_last, y_last), L::I::select(along_x, y_last, x_last)];
-    let turned = L::I::select(along_x, L::I::splat(TURNED as i32), none);
-    // Texel n reaches from n - 1/2 to n + 1/2; all relative to the middle's.
-    let reach = row.length * half;
-    let start = row.part[0] - reach + half;
-    let stop = row.part[0] + reach + half;
-    let mut texel = start.floor();
-    let scale = share.div(row.length);
+    let ring = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING) as i32);
+    let turned = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING + TURNED) as i32);
+    let reach = row.length * L::F::splat(0.5);
+    let middle = row.part[0] + L::F::splat(0.5);
+    let track: Track<L> = Track {
+        end: [L::I::select(along_x, x_end, y_end), L::I::select(along_x, y_end, x_end)],
+        last: [L::I::select(along_x, x_last, y_last), L::I::select(along_x, y_last, x_last)],
+        copy: L::I::select(along_x, turned, ring),
+        start: middle - reach,
+        stop: middle + reach,
+        scale: share.div(row.length),
+    };
+    let rest = inner::<L>(sheets, level, row, &track, lanes, sum, wanted);
+    if rest.any() {
+        outer::<L>(sheets, level, row, &track, rest, sum, wanted);
+    }
+}
+
+/// Those rows that lie in one tile as a whole. Returns the lanes whose rows do not.
+#[inline(always)]
+fn inner<L: Lanes>(
+    sheets: &mut Sheets<PhotoTile>,
+    level: i32,
+    row: &Row<L>,
+    track: &Track<L>,
+    lanes: L::M,
+    sum: &mut Sample<L>,
+    wanted: &mut Wanted,
+) -> L::M {
+    let none = L::I::splat(0);
+    let bits = L::I::splat(TILE_BITS);
+    let start = track.start.floor();
+    let stop = track.stop.floor();
+    let (low, high) = (row.cell[0] + start, row.cell[0] + stop);
+    let (one_end, _) = row.across(start.to_floats());
+    let (other_end, _) = row.across(stop.to_floats());
+    let (left, right) = (one_end.min(other_end), one_end.max(other_end));
+    let (along, across) = (low.shr(bits), left.shr(bits));
+    let outside = low.lt(none)
+        | track.end[0].lt(high)
+        | left.lt(none)
+        | !right.lt(track.end[1])
+        | track.last[0].lt(along)
+        | track.last[1].lt(across);
+    let inside = !outside & along.eq(high.shr(bits)) & across.eq(right.shr(bits));
+    let tx = L::I::select(row.along_x, along, across);
+    let ty = L::I::select(row.along_x, across, along);
+    let number = sheets.sheet(level).number::<L>(tx, ty);
+    // From a texel of the middle's cell in the tile.
+    let wide = L::I::splat(TILE_POSTS as i32);
+    let corner = (row.cell[0] - along.shl(bits)).times(wide) + track.copy - across.shl(bits);
+    let mut left = lanes & inside;
+    while left.any() {
+        let known = first::<L>(number, left);
+        let here = left & number.eq(L::I::splat(known));
+        left = left & !here;
+        let texels = match sheets.tile(level, known, wanted) {
+            Soil::Tile(tile) => tile.texels(),
+            Soil::Empty => continue,
+            Soil::Absent => {
+                sum.unsure = sum.unsure | here;
+                continue;
+            }
+        };
+        let mut at = corner + start.times(wide);
+        let mut step = start.to_floats();
+        let mut going = here;
+        while going.any() {
+            // A row has two texels at least.
+            for _ in 0..2 {
+                let (other, part) = row.across(step);
+                let weight = track.weight(step).max(L::F::splat(0.0));
+                add::<L>(texels, at + other, part, weight, going, sum);
+                step = step + L::F::splat(1.0);
+                at = at + wide;
+            }
+            going = going & step.lt(track.stop);
+        }
+    }
+    lanes & !inside
+}
+
+/// Rows texel by texel, from tile to tile. Beside the layer its outermost texels go on.
+#[inline(always)]
+fn outer<L: Lanes>(
+    sheets: &mut Sheets<PhotoTile>,
+    level: i32,
+    row: &Row<L>,
+    track: &Track<L>,
+    lanes: L::M,
+    sum: &mut Sample<L>,
+    wanted: &mut Wanted,
+) {
+    let (zero, none) = (L::F::splat(0.0), L::I::splat(0));
+    let sheet = sheets.sheet(level);
+    let mut texel = track.start.floor();
     let mut left = lanes;
     let mut known = -1;
     let mut tile = None;
-    loop {
+    while left.any() {
         let step = texel.to_floats();
-        let post = (row.cell[0] + texel).max(none).min(end[0]);
-        let side = row.part[1] + (step - row.part[0]) * row.slant;
-        let floor = side.floor();
-        let part = side - floor.to_floats();
-        let other = row.cell[1] + floor;
-        // Beside the layer its outermost texels go on.
+        let post = (row.cell[0] + texel).max(none).min(track.end[0]);
+        let (other, part) = row.across(step);
         let part = L::F::select(other.lt(none), zero, part);
-        let part = L::F::select(other.lt(end[1]), part, zero);
-        let other = other.max(none).min(end[1]);
-        let (tile_along, along) = Sheet::tile_of::<L>(last[0], post);
-        let (tile_across, across) = Sheet::tile_of::<L>(last[1], other);
-        let tx = L::I::select(along_x, tile_along, tile_across);
-        let ty = L::I::select(along_x, tile_across, tile_along);
+        let part = L::F::select(other.lt(track.end[1]), part, zero);
+        let other = other.max(none).min(track.end[1]);
+        let (tile_along, along) = Sheet::tile_of::<L>(track.last[0], post);
+        let (tile_across, across) = Sheet::tile_of::<L>(track.last[1], other);
+        let tx = L::I::select(row.along_x, tile_along, tile_across);
+        let ty = L::I::select(row.along_x, tile_across, tile_along);
         let number = sheet.number::<L>(tx, ty);
         let mut here = left & number.eq(L::I::splat(known));
         if !here.any() {
-            if !left.any() {
-                return;
-            }
             known = first::<L>(number, left);
             here = left & number.eq(L::I::splat(known));
             tile = match sheets.tile(level, known, wanted) {
@@ -194,29 +287,59 @@ fn mean<L: Lanes>(
             };
         }
         if let Some(texels) = tile {
-            let weight = (stop - step).min(step + one - start).min(one) * scale;
-            let weight = L::F::select(here, weight, zero);
-            let ring = L::I::splat(TILE_RING as i32);
-            let at = (along + ring).times(L::I::splat(TILE_POSTS as i32)) + across + ring + turned;
-            let (a, b) = L::I::gather_twos(texels.light, at, here);
-            for c in 0..3 {
-                let field = L::I::splat(FIELDS[c] as i32);
-                let (a, b) = ((a & field).to_floats(), (b & field).to_floats());
-                sum.light[c] = sum.light[c] + lerp::<L>(a * a, b * b, part) * weight;
-            }
-            let covered = match texels.coverage {
-                None => one,
-                Some(coverage) => {
-                    let pair = L::I::gather_pairs(coverage, at, here);
-                    let low = L::I::splat(0xFFFF);
-                    let (a, b) = (pair & low, pair.shr(L::I::splat(16)) & low);
-                    let full = L::F::splat(1.0 / 65535.0);
-                    lerp::<L>(a.to_floats(), b.to_floats(), part) * full
-                }
-            };
-            sum.coverage = sum.coverage + covered * weight;
+            let at = along.times(L::I::splat(TILE_POSTS as i32)) + across + track.copy;
+            add::<L>(texels, at, part, track.weight(step), here, sum);
         }
         texel = L::I::select(here, texel + L::I::splat(1), texel);
-        left = left & (!here | texel.to_floats().lt(stop));
+        left = left & (!here | texel.to_floats().lt(track.stop));
     }
+}
+
+impl<L: Lanes> Row<L> {
+    /// The texel across from one along the row, and how far it is to the next: both
+    /// relative to the middle's.
+    #[inline(always)]
+    fn across(&self, step: L::F) -> (L::I, L::F) {
+        let side = self.part[1] + (step - self.part[0]) * self.slant;
+        let floor = side.floor();
+        (self.cell[1] + floor, side - floor.to_floats())
+    }
+}
+
+impl<L: Lanes> Track<L> {
+    /// Weight of a texel of the row.
+    #[inline(always)]
+    fn weight(&self, step: L::F) -> L::F {
+        let one = L::F::splat(1.0);
+        (self.stop - step).min(step + one - self.start).min(one) * self.scale
+    }
+}
+
+/// Adds a texel, blended with the next one, to `sum`.
+#[inline(always)]
+fn add<L: Lanes>(
+    texels: Texels,
+    at: L::I,
+    part: L::F,
+    weight: L::F,
+    lanes: L::M,
+    sum: &mut Sample<L>,
+) {
+    let weight = L::F::select(lanes, weight, L::F::splat(0.0));
+    let (a, b) = L::I::gather_twos(texels.light, at, lanes);
+    for c in 0..3 {
+        let field = L::I::splat(FIELDS[c] as i32);
+        let (a, b) = ((a & field).to_floats(), (b & field).to_floats());
+        sum.light[c] = sum.light[c] + lerp::<L>(a * a, b * b, part) * weight;
+    }
+    let covered = match texels.coverage {
+        None => L::F::splat(1.0),
+        Some(coverage) => {
+            let pair = L::I::gather_pairs(coverage, at, lanes);
+            let low = L::I::splat(0xFFFF);
+            let (a, b) = (pair & low, pair.shr(L::I::splat(16)) & low);
+            lerp::<L>(a.to_floats(), b.to_floats(), part) * L::F::splat(1.0 / 65535.0)
+        }
+    };
+    sum.coverage = sum.coverage + covered * weight;
 }

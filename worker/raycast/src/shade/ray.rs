@@ -53,8 +53,9 @@ pub(crate) struct End<L: Lanes> {
     pub distance: L::F,
     /// The same along the camera's axis.
     pub depth: L::F,
-    /// Unit vector along which the ray comes in: over a round Earth it is flatter.
-    pub view: [L::F; 3],
+    /// How much flatter the ray comes in than it set out, over a round Earth: what is to
+    /// be added to the upward part of its direction.
+    pub falls: L::F,
 }
 
 impl Lens {
@@ -103,11 +104,11 @@ impl<L: Lanes> Ray<L> {
     #[inline(always)]
     pub(crate) fn end(&self, lens: &Lens, s: L::F) -> End<L> {
         let along = [self.heading[0] * s, self.heading[1] * s];
-        let [x, y, z] = self.view;
+        let z = self.view[2];
         if lens.curvature == 0.0 {
             let distance = s.div(self.level);
             let depth = distance * self.shortening;
-            return End { along, over: z * distance, distance, depth, view: self.view };
+            return End { along, over: z * distance, distance, depth, falls: L::F::splat(0.0) };
         }
         let one = L::F::splat(1.0);
         let k = L::F::splat(lens.curvature);
@@ -123,6 +124,6 @@ impl<L: Lanes> Ray<L> {
         let chord = chord * (one - square * L::F::splat(1.0 / 12.0));
         let distance = (over * over + chord).sqrt();
         let depth = distance * self.shortening;
-        End { along, over, distance, depth, view: [x, y, z + self.level * phi] }
+        End { along, over, distance, depth, falls: self.level * phi }
     }
 }

@@ -82,8 +82,7 @@ fn of_layer<L: Lanes>(
             let (ty, j) = Sheet::tile_of::<L>(L::I::splat(last[1]), place.cell[1]);
             let tiles = sheet.number::<L>(tx, ty);
             let number = first::<L>(tiles, left);
-            let here =
-                left & level.eq(L::I::splat(here_level)) & tiles.eq(L::I::splat(number));
+            let here = left & level.eq(L::I::splat(here_level)) & tiles.eq(L::I::splat(number));
             left = left & !here;
             let tile = match sheets.tile(here_level, number, wanted) {
                 Soil::Tile(tile) => tile,
@@ -134,12 +133,7 @@ fn rises<L: Lanes>(
 
 /// Twice the rise a cell where no post is void, in steps of the codes.
 #[inline(always)]
-fn whole_codes<L: Lanes>(
-    codes: &Codes,
-    at: L::I,
-    [x, y]: [L::F; 2],
-    lanes: L::M,
-) -> [L::F; 2] {
+fn whole_codes<L: Lanes>(codes: &Codes, at: L::I, [x, y]: [L::F; 2], lanes: L::M) -> [L::F; 2] {
     let width = L::I::splat(TILE_POSTS as i32);
     let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
     let (z01, z23) = L::I::gather_fours(codes.posts, at, lanes);

@@ -22,11 +22,8 @@ const ROCK_SLOPES: [f32; 2] = [0.35, 1.6];
 #[inline(always)]
 pub(crate) fn tint<L: Lanes>(height: L::F, slopes: [L::F; 2]) -> [L::F; 3] {
     let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-    let mut color = [
-        L::F::splat(RAMP[0].1[0]),
-        L::F::splat(RAMP[0].1[1]),
-        L::F::splat(RAMP[0].1[2]),
-    ];
+    let mut color =
+        [L::F::splat(RAMP[0].1[0]), L::F::splat(RAMP[0].1[1]), L::F::splat(RAMP[0].1[2])];
     let mut step = 1;
     while step < RAMP.len() {
         let ((low, from), (high, to)) = (RAMP[step - 1], RAMP[step]);
