@@ -30,6 +30,7 @@ mod cell;
 mod column;
 mod exact;
 mod field;
+mod frustum;
 mod grid;
 mod lanes;
 mod lattice;
