@@ -138,7 +138,7 @@ fn every_pixel_soon_has_a_confirmed_one_near_it() {
     let mut sight = Sight::new(field(&land), &view);
     let mut frusta = Frusta::new(&sight, Region::whole(size.0, size.1));
     let mut side = 32;
-    while side > 2 {
+    while side > NARROWEST_PX {
         // All frusta of a size: at most as many as fit.
         for _ in 0..(size.0 / side) * (size.1 / side) {
             frusta.step(&mut sight);
@@ -151,10 +151,10 @@ fn every_pixel_soon_has_a_confirmed_one_near_it() {
         }
         side /= 2;
     }
-    // Within a size they are spread: half of the next frusta leave no quarter behind.
+    // Within a size they are spread: a quarter of the next frusta serves all of the picture.
     let mut counts = [0u64; 4];
     let before: Vec<bool> = frusta.seen.inverse_depth.iter().map(|i| i.is_nan()).collect();
-    for _ in 0..(size.0 / 2) * (size.1 / 2) / 4 {
+    for _ in 0..(size.0 / side) * (size.1 / side) / 4 {
         frusta.step(&mut sight);
     }
     for (at, &unknown) in before.iter().enumerate() {
@@ -170,8 +170,7 @@ fn every_pixel_soon_has_a_confirmed_one_near_it() {
 #[test]
 fn missing_tiles_are_named_and_leave_their_pixels_unconfirmed() {
     let hills = |i, j| mountains(i, j, 128, 60.0, 4);
-    let (mut resident, tiles) =
-        store(vec![Plan::heights([0.0; 2], [1.0; 2], [700, 560], hills)]);
+    let (mut resident, tiles) = store(vec![Plan::heights([0.0; 2], [1.0; 2], [700, 560], hills)]);
     let pyramid = Pyramid::new(resident.index());
     let view = View {
         camera: Camera::from_angles(DVec3::new(350.0, 5.0, 90.0), 10.0, -12.0, 3.0, 60.0, SIZE),
