@@ -77,8 +77,6 @@ pub(crate) struct Frusta {
     /// What is known. A pixel that is not confirmed is NaN; when no frustum is left, that
     /// means that a tile is missing.
     pub seen: Seen,
-    /// Confirmed pixels.
-    pub confirmed: u64,
     /// The frusta of one size ...
     queue: VecDeque<Frustum>,
     /// ... and those of the next, by which quarter they are.
@@ -141,7 +139,6 @@ impl Frusta {
         Frusta {
             region,
             seen: Seen::new(region),
-            confirmed: 0,
             queue: numbered.into_iter().map(|(_, root)| root).collect(),
             quarters: [const { Vec::new() }; 4],
         }
@@ -192,9 +189,7 @@ impl Frusta {
     fn confirm(&mut self, x: u32, y: u32, inverse_depth: f32) {
         let (column, row) = (x - self.region.x, y - self.region.y);
         let at = row as usize * self.region.width as usize + column as usize;
-        let pixel = &mut self.seen.inverse_depth[at];
-        self.confirmed += u64::from(pixel.is_nan() && !inverse_depth.is_nan());
-        *pixel = inverse_depth;
+        self.seen.inverse_depth[at] = inverse_depth;
     }
 }
 

@@ -48,6 +48,7 @@ mod shade;
 mod srgb;
 #[cfg(test)]
 mod tests_support;
+mod voxel;
 mod walk;
 
 pub use lanes::Width;
