@@ -17,7 +17,7 @@ use terrafarm_common::id::{FrameIndex, LeaseId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::region::{Region, tiles};
 use terrafarm_raycast::meter::measure;
-use terrafarm_raycast::{Missing, Progress, Pyramid, Rendered, Stats, View, depths};
+use terrafarm_raycast::{Missing, Progress, Pyramid, Rendered, Stats, Unfit, Unseen, View, depths};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_terrain::resident::Resident;
 
@@ -39,12 +39,15 @@ pub trait Caster: Send + Sync + 'static {
     fn begin(&self, region: Region) -> Self::Piece;
 
     /// Does what can be done of a piece; the tiles that the rest of it waits for.
+    ///
+    /// # Errors
+    /// If the method is not made for the view.
     fn advance(
         &self,
         scene: &Scene<Self::Prepared>,
         view: &View,
         piece: &mut Self::Piece,
-    ) -> Vec<TileKey>;
+    ) -> Result<Vec<TileKey>, Unfit>;
 
     /// The pixels of a piece that waits for nothing.
     fn finish(&self, piece: Self::Piece) -> Rendered;
@@ -52,14 +55,14 @@ pub trait Caster: Send + Sync + 'static {
     /// How wrong the answer of the view's method is for pixel (x, y).
     ///
     /// # Errors
-    /// The tiles that are needed to tell and are not in memory.
+    /// The tiles that are needed to tell and are not in memory, or why the method will not.
     fn gauge(
         &self,
         scene: &Scene<Self::Prepared>,
         view: &View,
         x: u32,
         y: u32,
-    ) -> Result<PixelError, Vec<TileKey>>;
+    ) -> Result<PixelError, Unseen>;
 }
 
 /// The terrain as a job sees it.
@@ -86,7 +89,12 @@ impl Caster for RayCaster {
         Progress::new(region)
     }
 
-    fn advance(&self, scene: &Scene<Pyramid>, view: &View, piece: &mut Progress) -> Vec<TileKey> {
+    fn advance(
+        &self,
+        scene: &Scene<Pyramid>,
+        view: &View,
+        piece: &mut Progress,
+    ) -> Result<Vec<TileKey>, Unfit> {
         piece.advance(&scene.resident, &scene.prepared, view)
     }
 
@@ -100,12 +108,14 @@ impl Caster for RayCaster {
         view: &View,
         x: u32,
         y: u32,
-    ) -> Result<PixelError, Vec<TileKey>> {
+    ) -> Result<PixelError, Unseen> {
         let (resident, pyramid) = (&scene.resident, &scene.prepared);
         // A pixel does not depend on the region that it is asked for in.
         let alone = Region { x, y, width: 1, height: 1 };
-        let found = depths(resident, pyramid, view, alone).map_err(|Missing(tiles)| tiles)?;
-        measure(resident, pyramid, view, x, y, found.distance_m(view, x, y)).map_err(|Missing(tiles)| tiles)
+        let found = depths(resident, pyramid, view, alone)?;
+        let claimed = found.distance_m(view, x, y);
+        measure(resident, pyramid, view, x, y, claimed)
+            .map_err(|Missing(tiles)| Unseen::Missing(tiles))
     }
 }
 
@@ -195,8 +205,9 @@ impl<C: Caster> Job<C> {
         let began = Instant::now();
         let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene)));
         self.spent += began.elapsed();
-        let missing =
-            missing.map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?;
+        let missing = missing
+            .map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?
+            .map_err(|unfit| unfit.to_string())?;
         if self.stop.load(Ordering::Relaxed) {
             return Ok(Outcome::Stopped);
         }
@@ -207,25 +218,29 @@ impl<C: Caster> Job<C> {
     }
 
     /// One go over all pieces that are not done; the tiles they wait for.
-    fn sweep(&mut self, caster: &C, scene: &Scene<C::Prepared>) -> BTreeSet<TileKey> {
+    fn sweep(
+        &mut self,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+    ) -> Result<BTreeSet<TileKey>, Unfit> {
         let (view, stop, frame) = (&self.view, &self.stop, self.check.frame);
         let open = self.pieces.par_iter_mut().with_max_len(1).filter(|piece| !piece.is_done());
         let advanced = open.map(|piece| {
             if stop.load(Ordering::Relaxed) {
-                return BTreeSet::new();
+                return Ok(BTreeSet::new());
             }
             if !piece.rendered {
-                let missing = caster.advance(scene, view, &mut piece.progress);
+                let missing = caster.advance(scene, view, &mut piece.progress)?;
                 piece.rendered = missing.is_empty();
                 if !piece.rendered {
-                    return missing.into_iter().collect();
+                    return Ok(missing.into_iter().collect());
                 }
             }
             piece.measure(caster, scene, view, frame)
         });
-        advanced.reduce(BTreeSet::new, |mut all, more: BTreeSet<_>| {
+        advanced.try_reduce(BTreeSet::new, |mut all, more: BTreeSet<_>| {
             all.extend(more);
-            all
+            Ok(all)
         })
     }
 
@@ -278,20 +293,25 @@ impl<C: Caster> Piece<C> {
         scene: &Scene<C::Prepared>,
         view: &View,
         frame: FrameIndex,
-    ) -> BTreeSet<TileKey> {
+    ) -> Result<BTreeSet<TileKey>, Unfit> {
         let mut missing = BTreeSet::new();
         let errors = &mut self.errors;
+        let mut refused = None;
         self.unmeasured.retain(|&[x, y]| match caster.gauge(scene, view, x, y) {
             Ok(error) => {
                 errors.add(pixel_number(frame, x, y), &error);
                 false
             }
-            Err(tiles) => {
+            Err(Unseen::Unfit(unfit)) => {
+                refused = Some(unfit);
+                true
+            }
+            Err(Unseen::Missing(tiles)) => {
                 missing.extend(tiles);
                 true
             }
         });
-        missing
+        refused.map_or(Ok(missing), Err)
     }
 }
 

@@ -67,7 +67,7 @@ fn main() {
             assert!(sum.is_finite());
             traced.expect("all tiles are loaded")
         });
-        let (frame_s, rendered) = best(runs, || render(&resident, &pyramid, &view, frame));
+        let (frame_s, rendered) = best(runs, || render(&resident, &pyramid, &view, frame).expect("exact fits"));
         assert!(rendered.missing.is_empty());
         let pixels = f64::from(size.0) * f64::from(size.1);
         println!(
@@ -208,7 +208,7 @@ fn cold(
     let mut progress = Progress::new(frame);
     let (mut rounds, mut asked) = (0, 0);
     loop {
-        let missing = progress.advance(&resident, pyramid, view);
+        let missing = progress.advance(&resident, pyramid, view).expect("exact fits");
         if missing.is_empty() {
             break;
         }

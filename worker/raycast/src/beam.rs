@@ -21,10 +21,15 @@
 //! Height grows both with the square of the map distance and with the straight rise (see
 //! `path`), so it is bounded from below over an interval of depths by the least of both.
 
+mod abreast;
+
+use crate::exact::{Globe, Tiles};
 use crate::field::{Cursor, Field, Ground, tile_key};
 use crate::grid::cells_of;
+use crate::lanes;
 use crate::path;
 use crate::pyramid::Pyramid;
+use abreast::{Layer, Narrow, Squares};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -57,6 +62,11 @@ pub(crate) struct Beams<'a> {
     layers: Vec<Grid>,
     tiles: Cursor<'a>,
     first_step: f64,
+    /// Room to be kept above the ground, metres for each metre away.
+    slack: f64,
+    /// The only height layer, if there is but one.
+    only: Option<Layer<'a>>,
+    squares: Squares,
     /// Intervals of depth looked at.
     pub steps: u64,
 }
@@ -86,12 +96,24 @@ struct Bounds {
     across_squared: f64,
     /// The depth to which the bounds hold.
     reach: f64,
+    /// Length of the longest ray at depth 1.
+    longest: f64,
     /// Width of the beam at depth 1.
     width: f64,
 }
 
 impl<'a> Beams<'a> {
     pub(crate) fn new(field: Field<'a>, camera: &'a Camera, ground: path::Ground) -> Self {
+        Beams::with_slack(field, camera, ground, 0.0)
+    }
+
+    /// Beams over ground that may be higher than level 0 by so much for each metre away.
+    pub(crate) fn with_slack(
+        field: Field<'a>,
+        camera: &'a Camera,
+        ground: path::Ground,
+        slack: f64,
+    ) -> Self {
         let eye = camera.position;
         let mut first_step = 0.0f64;
         let layers = field.index().layers_of(LayerKind::Height).map(|(number, layer)| {
@@ -104,14 +126,48 @@ impl<'a> Beams<'a> {
             let eye = [0, 1].map(|axis| (eye[axis] - layer.origin[axis]) * scale[axis]);
             Grid { number, eye, scale, cells }
         });
-        let layers = layers.collect();
-        Beams { field, camera, ground, layers, tiles: Cursor::new(field), first_step, steps: 0 }
+        let layers: Vec<Grid> = layers.collect();
+        let only = match &layers[..] {
+            [grid] if !grid.cells.contains(&0) => Some(Layer {
+                camera,
+                globe: (ground.curvature() != 0.0).then(|| Globe::new(&ground, eye.z)),
+                eye: grid.eye,
+                scale: grid.scale,
+                cells: grid.cells,
+                highest: field.pyramid.highest(),
+                finest_step: 1.0 / grid.scale[0].max(grid.scale[1]),
+                slack,
+                tiles: Tiles::new(field, grid.number),
+            }),
+            _ => None,
+        };
+        let (tiles, squares) = (Cursor::new(field), Squares::new());
+        Beams { field, camera, ground, layers, tiles, first_step, slack, only, squares, steps: 0 }
     }
 
     /// Calls `see` for each pixel of a square with the depth up to which every ray
     /// through the pixel is free.
     pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(u32, u32, f64)) {
-        self.quarter(square, WIDEST_PX, Front { free: 0.0, step: self.first_step }, see);
+        let front = Front { free: 0.0, step: self.first_step };
+        if self.only.is_none() {
+            return self.quarter(square, WIDEST_PX, front, see);
+        }
+        let front = self.advance(&self.bounds(square), front);
+        let Some(layer) = &mut self.only else { return };
+        // Quarters are counted from the corner of the square, which a region may cut.
+        let squares = &mut self.squares;
+        squares.set(square.x, square.y, front.free, front.step);
+        let narrow = Narrow { layer, region: square, squares };
+        self.steps += lanes::run(narrow, lanes::widest());
+        let (right, bottom) = (square.x + square.width, square.y + square.height);
+        for at in 0..self.squares.count {
+            let (left, top) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
+            for row in top..(top + NARROWEST_PX).min(bottom) {
+                for column in left..(left + NARROWEST_PX).min(right) {
+                    see(column, row, self.squares.free[at]);
+                }
+            }
+        }
     }
 
     fn quarter(
@@ -173,6 +229,7 @@ impl<'a> Beams<'a> {
             } else {
                 FLAT_REACH_M / longest
             },
+            longest,
             width: f64::from(square.width.max(square.height)) / camera.focal_px(),
         }
     }
@@ -199,7 +256,7 @@ impl<'a> Beams<'a> {
             let end = (free + step).min(bounds.reach);
             let rise = (bounds.low.z * free).min(bounds.low.z * end);
             let z = eye_z + self.ground.rise(eye_z, bounds.across_squared * free * free, rise);
-            let lowest = z - CLEARANCE_M;
+            let lowest = z - CLEARANCE_M - self.slack * end * bounds.longest;
             if bounds.low.z >= 0.0 && lowest > self.field.pyramid.highest() {
                 return Front { free: f64::INFINITY, step };
             }

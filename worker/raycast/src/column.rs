@@ -7,28 +7,44 @@
 //! there are: neighbours are about four pixels apart for each pixel of tolerance.
 //!
 //! What rays find is kept as inverse depth, which over a plane is linear in the picture. A
-//! pixel is interpolated between the four rays around it if they see neighbouring ground.
-//! Where they do not, at ridges, and close to V the pixel has a ray of its own, that of
-//! `lod`.
+//! pixel is first guessed between the four rays around it, if they see neighbouring ground,
+//! then compared with the surface at that very place: what is off by more than half the
+//! tolerance is corrected along the pixel's own ray and compared again. Where the rays see
+//! different ground, where the corrections do not settle, and close to V, the pixel has a
+//! ray of its own, that of `lod`. So every pixel shows a point of the surface, to the
+//! tolerance; what a pixel can miss is ground in front that is narrower than the distance
+//! between rays.
 
-use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask};
+use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask, as_bits};
 use crate::lattice::{Band, Fan, Frame};
 use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
 use crate::seen::Seen;
-use crate::walk::{Lines, Rows, Walk, as_bits};
+use crate::walk::{Lines, Rows, Slopes, Walk};
 use glam::DVec2;
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
 
 /// Distance between lines, pixels for each pixel of tolerance, and the least and the most.
-/// Measured (`bench core`): the 99th percentile of the error then is below the tolerance
-/// by a quarter.
+/// Measured (`bench core`): more lines cost more, fewer leave more pixels to rays of their
+/// own.
 const SPACING: f64 = 5.0;
 const SPACINGS: [f64; 2] = [0.5, 4.0];
 /// Rays see neighbouring ground if their depths differ by no more than this share.
 const NEIGHBOURS: f32 = 0.02;
+/// How much closer than the nearest ground seen around a pixel its own ray begins to look:
+/// a ridge may come closer between the rays around it.
+const SHARE_FREE: f32 = 0.9;
+/// Share of the tolerance by which a pixel may be off the surface without being corrected.
+/// The other half is for the surface: see [`LEVELS`].
+const ALLOWED: f64 = 0.5;
+/// Share of the tolerance by which the levels of the surface may be off level 0.
+pub(crate) const LEVELS: f64 = 0.5;
+/// How often a pixel is compared with the surface at most ...
+const CORRECTIONS: usize = 4;
+/// ... and by what share of its depth it may be moved each time.
+const FARTHEST: f32 = 0.05;
 /// Lines a pixel up to which those between N pixels are no more than 2 N.
 const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
@@ -52,6 +68,11 @@ struct Span {
 /// `first_line`.
 struct Net {
     answers: Vec<f32>,
+    /// By the first of the four answers around a cell of the net: 1 if here or in one of
+    /// the eight cells around the four are not of neighbouring ground, else 0.
+    breaks: Vec<f32>,
+    /// The same without the cells around.
+    own_breaks: Vec<f32>,
     width: usize,
     first_ray: usize,
     first_line: i32,
@@ -64,7 +85,13 @@ impl Kernel for Columns<'_, '_> {
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
         let mut seen = Seen::new(self.region);
-        let mut net = Net { answers: Vec::new(), width: 0, first_ray: 0, first_line: 0 };
+        let mut net = Net {
+            answers: Vec::new(),
+            breaks: Vec::new(),
+            own_breaks: Vec::new(),
+            width: 0, first_ray: 0,
+            first_line: 0,
+        };
         let mut alone = Vec::new();
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
@@ -98,7 +125,7 @@ impl Kernel for Columns<'_, '_> {
                 let near = frames[0].owns(x, y) && frames[0].is_near(y)
                     || frames[1].owns(y, x) && frames[1].is_near(x);
                 if near {
-                    alone.push(Alone { at, nearest: f32::INFINITY });
+                    alone.push(Alone { at, free: 0.0 });
                 }
             }
         }
@@ -107,6 +134,40 @@ impl Kernel for Columns<'_, '_> {
         seen.steps +=
             cast_pixels::<L>(self.relief, self.camera, self.region, &alone, &mut seen.inverse_depth);
         seen
+    }
+}
+
+impl Net {
+    /// Finds the cells where the picture breaks, and their neighbours.
+    #[inline(always)]
+    fn compare<L: Lanes>(&mut self) {
+        let Net { answers, breaks, own_breaks, width, .. } = self;
+        let (width, count) = (*width, answers.len());
+        // A margin for the vectors beyond the end.
+        answers.resize(count + width + 2 * MOST, 0.0);
+        for list in [&mut *breaks, &mut *own_breaks] {
+            list.clear();
+            list.resize(count + width + 2 * MOST, 0.0);
+        }
+        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
+        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
+        for at in (0..count).step_by(L::N) {
+            let (a, b) = (L::F::load(&answers[at..]), L::F::load(&answers[at + 1..]));
+            let next = if at + width < count { at + width } else { at };
+            let (c, e) = (L::F::load(&answers[next..]), L::F::load(&answers[next + 1..]));
+            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
+            let same = (high * neighbours).le(low);
+            L::F::select(same, zero, one).store(&mut own_breaks[at..]);
+        }
+        for at in (1..count).step_by(L::N) {
+            let mut worst = zero;
+            for row in [at.saturating_sub(width).max(1), at, at + width] {
+                for place in [row - 1, row, row + 1] {
+                    worst = worst.max(L::F::load(&own_breaks[place..]));
+                }
+            }
+            worst.store(&mut breaks[at..]);
+        }
     }
 }
 
@@ -131,8 +192,8 @@ fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 
         let middle = f64::from(row) + 0.5;
         let line = |pixel: u32| fan.line(f64::from(pixel) + 0.5, middle);
         let (a, b) = (line(pixels.start), line(pixels.end - 1));
-        // One more on each side makes up for rounding.
-        let lines = a.min(b).floor() as i32 - 1..a.max(b).floor() as i32 + 3;
+        // One more on each side to compare with, and one makes up for rounding.
+        let lines = a.min(b).floor() as i32 - 2..a.max(b).floor() as i32 + 4;
         Span { pixels, lines }
     };
     rows.map(span).collect()
@@ -153,7 +214,8 @@ impl Columns<'_, '_> {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
         let rays = |row: u32| {
             let (before, rest) = fan.rays(row);
-            before..before + 1 + usize::from(rest > 0.0)
+            // And one more on each side to compare with.
+            before.saturating_sub(1)..before + 2 + usize::from(rest > 0.0)
         };
         let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
@@ -174,6 +236,7 @@ impl Columns<'_, '_> {
                 seen.steps += self.block::<L>(frame, fan, block, low..high, net);
             }
         }
+        net.compare::<L>();
     }
 
     /// Casts rays of N lines. Returns the steps that it took.
@@ -248,12 +311,14 @@ impl Columns<'_, '_> {
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
         let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
         let scale_f = L::F::splat(scale as f32);
+        let begin = frame.corner + frame.major * (f64::from(row) + 0.5);
         let (ray, down) = fan.rays(row);
         let at = (ray - net.first_ray) * net.width;
         let before = &net.answers[at..at + net.width];
-        let after = if down > 0.0 { &net.answers[at + net.width..at + 2 * net.width] } else { before };
+        let next = if down > 0.0 { at + net.width } else { at };
+        let after = &net.answers[next..next + net.width];
+        let breaks = &net.breaks[at..at + net.width];
         let down = L::F::splat(down);
-        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
         let numbers = L::F::load(&NUMBERS);
         let sparse = scale < DENSEST;
         let region = self.region;
@@ -266,30 +331,35 @@ impl Columns<'_, '_> {
             let left = line.floor();
             let share = line - left.to_floats();
             let left = left - L::I::splat(net.first_line);
-            let [a, b, c, e] = if sparse {
+            let ((a, b), (c, e), broken) = if sparse {
                 left.store(&mut places);
                 let base = places[0].max(0) as usize;
                 let left = left - L::I::splat(base as i32);
-                [
-                    L::F::lookup(&before[base..], left),
-                    L::F::lookup(&before[base + 1..], left),
-                    L::F::lookup(&after[base..], left),
-                    L::F::lookup(&after[base + 1..], left),
-                ]
+                (
+                    looked_up::<L>(&before[base..], left),
+                    looked_up::<L>(&after[base..], left),
+                    L::F::lookup(&breaks[base..], left),
+                )
             } else {
-                let right = left + L::I::splat(1);
-                [
+                (
                     gathered::<L>(before, left),
-                    gathered::<L>(before, right),
                     gathered::<L>(after, left),
-                    gathered::<L>(after, right),
-                ]
+                    gathered::<L>(breaks, left).0,
+                )
             };
-            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
-            let close = (high * neighbours).le(low);
+            let high = a.max(b).max(c.max(e));
+            let close = broken.eq(L::F::splat(0.0));
             let (above, below) = (a + (b - a) * share, c + (e - c) * share);
-            let answer = above + (below - above) * down;
+            let guess = above + (below - above) * down;
             let count = L::N.min((pixels.end - pixel) as usize);
+            let all = L::M::from_bits(u32::MAX >> (32 - count));
+            let sky = high.eq(L::F::splat(0.0));
+            let mut ray = [minor; 3];
+            for n in 0..3 {
+                ray[n] = L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32);
+            }
+            let (answer, sure) = self.settle::<L>(ray, guess, close & all & !sky);
+            let close = sure | (sky & close);
             let mut strange = (!close).bits() & (u32::MAX >> (32 - count));
             if strange != 0 {
                 high.store(&mut nearest);
@@ -305,8 +375,8 @@ impl Columns<'_, '_> {
                 }
                 while strange != 0 {
                     let lane = strange.trailing_zeros();
-                    let nearest = nearest[lane as usize % MOST];
-                    alone.push(Alone { at: at as u32 + lane, nearest });
+                    let free = free_before(nearest[lane as usize % MOST]);
+                    alone.push(Alone { at: at as u32 + lane, free });
                     strange &= strange - 1;
                 }
             } else {
@@ -319,14 +389,61 @@ impl Columns<'_, '_> {
                 }
                 while strange != 0 {
                     let lane = strange.trailing_zeros();
-                    let nearest = nearest[lane as usize % MOST];
+                    let free = free_before(nearest[lane as usize % MOST]);
                     let at = (at + column) as u32 + lane * region.width;
-                    alone.push(Alone { at, nearest });
+                    alone.push(Alone { at, free });
                     strange &= strange - 1;
                 }
             }
         }
     }
+}
+
+impl Columns<'_, '_> {
+    /// Moves guesses along rays until they are on the surface. Returns which have got
+    /// there.
+    #[inline(always)]
+    fn settle<L: Lanes>(&self, ray: [L::F; 3], guess: L::F, lanes: L::M) -> (L::F, L::M) {
+        let one = L::F::splat(1.0);
+        let [x, y, z] = ray;
+        let across = x * x + y * y;
+        // The tolerance as a length at depth 1: |ray| / focal.
+        let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
+        let allowed = L::F::splat((allowed * allowed) as f32) * (across + z * z);
+        let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
+        for _ in 0..CORRECTIONS {
+            let depth = one.div(answer);
+            let (solid, ground, slopes) =
+                self.relief.surface::<L>([x * depth, y * depth], left);
+            let (height, rise) = if self.relief.curvature == 0.0 {
+                (z * depth, z)
+            } else {
+                let length = across.sqrt();
+                let slopes = Slopes::<L>::new(self.relief, z.div(length));
+                let bend = L::F::splat(self.relief.curvature as f32) * across * depth;
+                (slopes.height(length * depth), z + bend)
+            };
+            let off = height - ground;
+            let share = off * answer;
+            sure = sure | (left & solid & (share * share).le(allowed));
+            left = left & solid & !sure;
+            if !left.any() {
+                break;
+            }
+            let closing = rise - slopes[0] * x - slopes[1] * y;
+            let corrected = one.div(depth - off.div(closing));
+            let near = (corrected - answer).abs().lt(L::F::splat(FARTHEST) * answer);
+            left = left & near;
+            answer = L::F::select(left, corrected, answer);
+        }
+        (answer, sure)
+    }
+}
+
+/// The depth from which a pixel's own ray looks for ground, if the nearest that is seen
+/// around it has this inverse depth.
+fn free_before(nearest: f32) -> f32 {
+    if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 }
 }
 
 /// The numbers of the lanes.
@@ -340,7 +457,16 @@ const NUMBERS: [f32; MOST] = {
     numbers
 };
 
+/// Elements of a row and those after them, the first less than 2 N further on.
 #[inline(always)]
-fn gathered<L: Lanes>(table: &[f32], at: L::I) -> L::F {
-    L::F::from_bits(L::I::gather(as_bits(table), at, !L::M::none()))
+fn looked_up<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    (L::F::lookup(row, at), L::F::lookup(&row[1..], at))
+}
+
+/// The same, however far on they are.
+#[inline(always)]
+fn gathered<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
+    let (row, all) = (as_bits(row), !L::M::none());
+    let next = at + L::I::splat(1);
+    (L::F::from_bits(L::I::gather(row, at, all)), L::F::from_bits(L::I::gather(row, next, all)))
 }

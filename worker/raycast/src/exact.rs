@@ -17,6 +17,16 @@
 //! cells whose own test would have found nothing, and a contact is a function of the ray
 //! and of the cell that it lies in.
 
+mod abreast;
+mod arc;
+mod many;
+mod rays;
+mod tiles;
+
+pub(crate) use arc::Globe;
+pub(crate) use many::Many;
+pub(crate) use tiles::Tiles;
+
 use crate::cell::{first_contact, place_in_cell};
 use crate::field::{
     Contact, Cursor, Field, Ground, Outcome, Stretch, Wanted, corners_in, next_stretch, tile_key,
@@ -359,3 +369,6 @@ impl<'c> Course<'c> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,4 +1,4 @@
-//! Several rays at once: vectors of f32 and i32, one kernel for every width.
+//! Several rays at once: vectors of f32, f64 and i32, one kernel for every width.
 //!
 //! A kernel is written once, over [`Lanes`]. [`One`] is its scalar twin; `Eight` needs
 //! AVX2 and `Sixteen` AVX-512. All do the same IEEE operations on each lane, none fuses a
@@ -15,10 +15,6 @@ mod avx2;
 mod avx512;
 mod one;
 
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx2::Eight;
-#[cfg(target_arch = "x86_64")]
-pub(crate) use avx512::Sixteen;
 pub(crate) use one::One;
 
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -34,6 +30,7 @@ pub(crate) trait Lanes: Copy + 'static {
     type F: Floats<I = Self::I, M = Self::M>;
     type I: Ints<F = Self::F, M = Self::M>;
     type M: Mask;
+    type D: Doubles<F = Self::F, I = Self::I, M = Self::M>;
 }
 
 /// One f32 a lane.
@@ -64,12 +61,48 @@ pub(crate) trait Floats:
     fn floor(self) -> Self::I;
     /// The same bits.
     fn from_bits(bits: Self::I) -> Self;
+    fn to_bits(self) -> Self::I;
     /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
     /// if the table has fewer.
     fn lookup(table: &[f32], at: Self::I) -> Self;
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
+}
+
+/// One f64 a lane.
+pub(crate) trait Doubles:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self>
+{
+    type F;
+    type I;
+    type M;
+    fn splat(value: f64) -> Self;
+    /// The first N values of a slice; panics if there are fewer.
+    fn load(values: &[f64]) -> Self;
+    /// Into the first N places of a slice; panics if there are fewer.
+    fn store(self, values: &mut [f64]);
+    /// The lanes in `mask` take the first values of a slice, in their order; the others
+    /// stay. Panics if the slice has fewer than N.
+    fn refill(self, values: &[f64], mask: Self::M) -> Self;
+    fn div(self, by: Self) -> Self;
+    fn sqrt(self) -> Self;
+    /// `self` if it is less, else `other`.
+    fn min(self, other: Self) -> Self;
+    /// `self` if it is greater, else `other`.
+    fn max(self, other: Self) -> Self;
+    fn abs(self) -> Self;
+    fn lt(self, other: Self) -> Self::M;
+    fn le(self, other: Self) -> Self::M;
+    fn select(mask: Self::M, yes: Self, no: Self) -> Self;
+    /// Towards zero; beyond the range of i32 and for NaN, `i32::MIN`.
+    fn truncate(self) -> Self::I;
+    /// The same value.
+    fn from_ints(ints: Self::I) -> Self;
+    /// The same value.
+    fn from_floats(floats: Self::F) -> Self;
+    /// The nearest f32, as f64.
+    fn to_single(self) -> Self;
 }
 
 /// One i32 a lane; arithmetic wraps.
@@ -98,15 +131,19 @@ pub(crate) trait Ints:
     ///
     /// # Safety
     /// For each lane in `mask`, `last + 4` bytes from its base can be read.
-    unsafe fn gather_from(
-        bases: &[*const u8; MOST],
-        at: Self,
-        last: Self,
-        mask: Self::M,
-    ) -> Self;
-    /// For each lane in `mask` an element of a table, lanes outside get 0. An index outside
-    /// the table reads from its end.
+    unsafe fn gather_from(bases: &[*const u8; MOST], at: Self, last: Self, mask: Self::M) -> Self;
+    /// For each lane in `mask` the elements `at` (low half) and `at + 1` (high half) of a
+    /// table of at least two; lanes outside get 0. An index outside the table reads from
+    /// its end.
+    fn gather_pairs(table: &[u16], at: Self, mask: Self::M) -> Self;
+    /// The same for single elements of 32 bits.
     fn gather(table: &[u32], at: Self, mask: Self::M) -> Self;
+    /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
+    /// lanes outside get 0. An index outside the table reads from its end.
+    fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
+    /// For each lane in `mask` the elements `at` to `at + 3` of a table of at least four,
+    /// as pairs; as above.
+    fn gather_fours(table: &[u16], at: Self, mask: Self::M) -> (Self, Self);
 }
 
 /// A yes or no a lane.
@@ -197,3 +234,8 @@ pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
     }
 }
 
+/// Floats as the bits that they are.
+pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
+    // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
+    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
+}

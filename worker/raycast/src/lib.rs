@@ -29,6 +29,7 @@ mod beam;
 mod cell;
 mod column;
 mod exact;
+mod fast;
 mod field;
 mod frustum;
 mod grid;
@@ -38,6 +39,7 @@ mod lod;
 pub mod meter;
 #[cfg(test)]
 mod oracle;
+mod painter;
 mod path;
 mod progress;
 mod pyramid;
@@ -45,6 +47,7 @@ mod reference;
 mod relief;
 mod seen;
 mod shade;
+mod sight;
 mod srgb;
 #[cfg(test)]
 mod tests_support;
@@ -52,8 +55,11 @@ mod voxel;
 mod walk;
 
 pub use lanes::Width;
-pub use progress::{Depths, Hit, Missing, Progress, Rendered, Stats, cast, depths, trace};
+pub use progress::{Progress, Rendered, Stats};
+pub use seen::Unfit;
+pub use sight::{Depths, Hit, Missing, Unseen, cast, depths, trace};
 pub use pyramid::Pyramid;
+pub use shade::shade;
 
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
@@ -76,8 +82,16 @@ pub struct View {
 ///
 /// Pixels that depend on tiles which are not loaded stay black, and the tiles are named;
 /// use [`Progress`] to go on without repeating what is done.
-pub fn render(resident: &Resident, pyramid: &Pyramid, view: &View, region: Region) -> Rendered {
+///
+/// # Errors
+/// If the method is not made for the view.
+pub fn render(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+) -> Result<Rendered, Unfit> {
     let mut progress = Progress::new(region);
-    let missing = progress.advance(resident, pyramid, view);
-    progress.into_rendered(missing)
+    let missing = progress.advance(resident, pyramid, view)?;
+    Ok(progress.into_rendered(missing))
 }

@@ -38,7 +38,7 @@
 use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
 use crate::path::{Ground, Path};
-use crate::progress::path;
+use crate::painter::path;
 use crate::pyramid::Pyramid;
 use crate::{Missing, View};
 use glam::DVec3;

@@ -26,10 +26,10 @@ use glam::DVec3;
 use terrafarm_common::shading::Earth;
 
 /// The longest way of a ray over flat ground, metres.
-const FLAT_REACH_M: f64 = 1e9;
+pub(crate) const FLAT_REACH_M: f64 = 1e9;
 /// The longest arc of a ray over the Earth, radians: 1460 km with refraction. From 10 km
 /// up the horizon is 360 km away, and a peak as high as that shows at 720 km.
-const REACH_RAD: f64 = 0.2;
+pub(crate) const REACH_RAD: f64 = 0.2;
 
 /// The ground under a ray: flat, or a sphere.
 #[derive(Debug, Clone, Copy)]
@@ -57,6 +57,11 @@ impl Ground {
         self.curvature
     }
 
+    /// Length of a span of u; infinite for flat ground.
+    pub(crate) fn span_u(&self) -> f64 {
+        self.span_u
+    }
+
     /// Height above the start, at map distance `across` and straight rise `rise`
     /// (|d.xy| u and d.z u), for a start at height `z0`. Grows with both.
     pub(crate) fn rise(&self, z0: f64, across_squared: f64, rise: f64) -> f64 {
@@ -71,7 +76,7 @@ impl Ground {
 }
 
 /// Squared angle below which the series of [`sinc_versine`] may end early: 64 km.
-const SHORT_ARC: f64 = 1e-4;
+pub(crate) const SHORT_ARC: f64 = 1e-4;
 
 /// sinc(phi) and 1 - cos(phi) of a squared angle up to 0.04, by their series; the terms
 /// left out are below 1e-17 of the first.

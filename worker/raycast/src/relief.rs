@@ -11,11 +11,12 @@
 use crate::View;
 use crate::field::Field;
 use crate::grid::cells_of;
+use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, as_bits};
 use crate::path::Ground;
 use std::cell::RefCell;
-use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TileKey};
+use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TILE_POSTS, TILE_RING, TileKey};
 use terrafarm_terrain::resident::Lookup;
-use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
+use terrafarm_terrain::tile::{HeightTile, Heights, MAXIMA_LEVELS, VOID};
 
 /// The coarsest level of a plot: a plot then is one cell.
 const COARSEST: usize = MAXIMA_LEVELS;
@@ -28,7 +29,7 @@ pub(crate) struct Relief<'a> {
     number: usize,
     layer: &'a Layer,
     /// Vertical distance that the tolerance allows at a distance of 1 m.
-    tolerance: f64,
+    pub tolerance: f64,
     /// The camera: the cell it is over, its place in it, its height, metres.
     pub eye_cell: [i32; 2],
     pub eye_place: [f32; 2],
@@ -71,15 +72,11 @@ pub(crate) enum Soil<'a> {
 }
 
 impl<'a> Relief<'a> {
-    /// `None` if the store has no height layer, more than one, or one without cells.
-    pub(crate) fn new(field: Field<'a>, view: &View) -> Option<Self> {
-        let index = field.index();
-        let mut layers = index.layers_of(LayerKind::Height);
-        let (number, layer) = layers.next()?;
+    /// The store must have one height layer, with at least one cell.
+    pub(crate) fn new(field: Field<'a>, view: &View, tolerance_px: f64) -> Self {
+        let (number, layer) =
+            field.index().layers_of(LayerKind::Height).next().expect("the store has heights");
         let cells = cells_of(layer);
-        if layers.next().is_some() || cells.contains(&0) {
-            return None;
-        }
         let camera = &view.camera;
         let place = [0, 1].map(|axis| {
             let place = (camera.position[axis] - layer.origin[axis]) / layer.spacing[axis];
@@ -92,11 +89,11 @@ impl<'a> Relief<'a> {
             plots: Vec::new(),
             wanted: Vec::new(),
         };
-        Some(Relief {
+        Relief {
             field,
             number,
             layer,
-            tolerance: view.quality.tolerance_px / camera.focal_px(),
+            tolerance: tolerance_px / camera.focal_px(),
             eye_cell: cell.map(|cell| cell as i32),
             eye_place: [0, 1].map(|axis| (place[axis] - cell[axis]) as f32),
             eye_z: camera.position.z,
@@ -105,7 +102,7 @@ impl<'a> Relief<'a> {
             curvature: Ground::new(view.shading.earth).curvature(),
             plots,
             known: RefCell::new(known),
-        })
+        }
     }
 
     /// The plot with a number: `row * plots[0] + column`.
@@ -120,9 +117,63 @@ impl<'a> Relief<'a> {
         self.meet(number)
     }
 
-    /// Tiles that were needed but not loaded.
+    /// The surface under places on the map, metres from the camera: whether there is any,
+    /// its height over the camera, and its slopes along x and y. What it takes of a tile
+    /// that is not loaded is not there.
+    #[inline(always)]
+    pub(crate) fn surface<L: Lanes>(
+        &self,
+        place: [L::F; 2],
+        lanes: L::M,
+    ) -> (L::M, L::F, [L::F; 2]) {
+        let zero = L::F::splat(0.0);
+        let scale = [0, 1].map(|axis| (1.0 / self.spacing[axis]) as f32);
+        let x = L::F::splat(self.eye_place[0]) + place[0] * L::F::splat(scale[0]);
+        let y = L::F::splat(self.eye_place[1]) + place[1] * L::F::splat(scale[1]);
+        let cell_x = x.floor() + L::I::splat(self.eye_cell[0]);
+        let cell_y = y.floor() + L::I::splat(self.eye_cell[1]);
+        let none = L::I::splat(-1);
+        let inside = none.lt(cell_x)
+            & none.lt(cell_y)
+            & cell_x.lt(L::I::splat(self.cells[0]))
+            & cell_y.lt(L::I::splat(self.cells[1]));
+        let bits = L::I::splat(MAXIMA_LEVELS as i32);
+        let plots = cell_y.shr(bits).times(L::I::splat(self.plots[0])) + cell_x.shr(bits);
+        let (mut solid, mut height, mut slopes) = (L::M::none(), zero, [zero; 2]);
+        let mut left = lanes & inside;
+        let mut numbers = [0; MOST];
+        plots.store(&mut numbers);
+        while left.any() {
+            let number = numbers[left.bits().trailing_zeros() as usize % MOST];
+            let here = left & plots.eq(L::I::splat(number));
+            left = left & !here;
+            let Plot { ground: Soil::Tile(tile), level } = self.plot(number) else { continue };
+            let base = L::I::splat(level as i32);
+            let shrink = L::F::splat(1.0 / (1u32 << level) as f32);
+            let (i, j) = (cell_x.shr(base), cell_y.shr(base));
+            let corner_x = (i.shl(base) - L::I::splat(self.eye_cell[0])).to_floats();
+            let corner_y = (j.shl(base) - L::I::splat(self.eye_cell[1])).to_floats();
+            let (u, v) = ((x - corner_x) * shrink, (y - corner_y) * shrink);
+            let (there, [sw, se, nw, ne]) = corners::<L>(tile, self.eye_z, [i, j], here);
+            let (south, north) = (se - sw, ne - nw);
+            let (low, high) = (sw + south * u, nw + north * u);
+            let found = low + (high - low) * v;
+            let slope_x = (south + (north - south) * v) * (shrink * L::F::splat(scale[0]));
+            let slope_y = (high - low) * (shrink * L::F::splat(scale[1]));
+            height = L::F::select(here, found, height);
+            slopes[0] = L::F::select(here, slope_x, slopes[0]);
+            slopes[1] = L::F::select(here, slope_y, slopes[1]);
+            solid = solid | (here & there);
+        }
+        (solid, height, slopes)
+    }
+
+    /// Tiles that were needed but not loaded, sorted, each once.
     pub(crate) fn wanted(&self) -> Vec<TileKey> {
-        self.known.borrow().wanted.clone()
+        let mut wanted = self.known.borrow().wanted.clone();
+        wanted.sort_unstable();
+        wanted.dedup();
+        wanted
     }
 
     #[cold]
@@ -186,5 +237,61 @@ impl<'a> Relief<'a> {
             (eye - f64::from(entry.max)).max(f64::from(entry.min) - eye).max(0.0)
         });
         (across + above * above).sqrt()
+    }
+}
+
+/// Whether cells have ground, and the heights of their corners over the camera: south-west,
+/// south-east, north-west, north-east.
+#[inline(always)]
+fn corners<L: Lanes>(
+    tile: &HeightTile,
+    eye_z: f64,
+    cell: [L::I; 2],
+    lanes: L::M,
+) -> (L::M, [L::F; 4]) {
+    let mask = L::I::splat(TILE_CELLS as i32 - 1);
+    let ring = L::I::splat(TILE_RING as i32);
+    let width = L::I::splat(TILE_POSTS as i32);
+    let at = ((cell[1] & mask) + ring).times(width) + (cell[0] & mask) + ring;
+    let north = at + width;
+    match tile.heights() {
+        Heights::Codes(codes) => {
+            let base = L::F::splat((f64::from(codes.base) * codes.step - eye_z) as f32);
+            let step = L::F::splat(codes.step as f32);
+            let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
+            let south = L::I::gather_pairs(codes.posts, at, lanes);
+            let north = L::I::gather_pairs(codes.posts, north, lanes);
+            let (sw, se) = (south & low, south.shr(sixteen) & low);
+            let (nw, ne) = (north & low, north.shr(sixteen) & low);
+            let there = sw.max(se).max(nw.max(ne)).lt(L::I::splat(i32::from(VOID)));
+            let heights = [
+                base + sw.to_floats() * step,
+                base + se.to_floats() * step,
+                base + nw.to_floats() * step,
+                base + ne.to_floats() * step,
+            ];
+            (there, heights)
+        }
+        Heights::Floats(floats) => {
+            let posts = as_bits(floats.posts);
+            let high = eye_z as f32;
+            let eye = [L::F::splat(high), L::F::splat((eye_z - f64::from(high)) as f32)];
+            let one = L::I::splat(1);
+            let [sw, se, nw, ne] = [
+                L::I::gather(posts, at, lanes),
+                L::I::gather(posts, at + one, lanes),
+                L::I::gather(posts, north, lanes),
+                L::I::gather(posts, north + one, lanes),
+            ];
+            let heights = [
+                L::F::from_bits(sw) - eye[0] - eye[1],
+                L::F::from_bits(se) - eye[0] - eye[1],
+                L::F::from_bits(nw) - eye[0] - eye[1],
+                L::F::from_bits(ne) - eye[0] - eye[1],
+            ];
+            // A void is NaN, and so is any sum with it.
+            let sum = heights[0] + heights[1] + heights[2] + heights[3];
+            (sum.eq(sum), heights)
+        }
     }
 }

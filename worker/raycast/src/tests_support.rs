@@ -190,7 +190,7 @@ impl Samples {
                     let at = clamped(j, size[1]) * size[0] as i64 + clamped(i, size[0]);
                     colors[at as usize].map(|value| (value * 65535.0 + 0.5) as u16)
                 };
-                let tile = PhotoTile::new(spots.map(texel).collect());
+                let tile = PhotoTile::new(&spots.map(texel).collect::<Vec<_>>());
                 let entry = TileEntry { hash: made, length: 1, ..TileEntry::EMPTY };
                 (TileEntry { min: 0.0, max: 0.0, ..entry }, tile.map(|t| Tile::Photo(Arc::new(t))))
             }

@@ -27,7 +27,8 @@ const CLEARANCE_SHARE: f32 = 2e-6;
 const ALONG_GRID: f32 = 1e-12;
 /// The plot of lanes that have left the layer.
 const NOWHERE: i32 = -1;
-/// Rounds of which one is for the lanes that seek and one for those that walk, however few.
+/// Rounds of which one each is for the lanes that seek, that walk and that come to a plot,
+/// however few.
 const TURNS: u32 = 8;
 /// Cells that a ray passes one by one before it looks at blocks of them. Measured at the
 /// views of `bench core`.
@@ -87,8 +88,10 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     row: L::I,
     slopes: Slopes<L>,
     across: L::F,
-    /// The plot, or `NOWHERE` if the lane has left the layer or cast its last ray.
+    /// The plot, or `NOWHERE` if the lane has left the layer or cast its last ray ...
     plot: L::I,
+    /// ... and its column and row.
+    corner: [L::I; 2],
     /// How far the ray is known to be free.
     free: L::F,
     /// The cell of the plot's level that a lane seeks from, and the block around it.
@@ -313,6 +316,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             slopes,
             across,
             plot,
+            corner: [column, row],
             free,
             cell: [zero; 2],
             block: L::I::splat(block),
@@ -346,22 +350,24 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let mut seeking = L::M::none();
         let mut turn = 0;
         loop {
-            while entering.any() {
-                left = left & !self.plot.eq(nowhere);
-                let inside = self.enter(&mut soil, entering & left);
-                seeking = seeking | inside;
-                entering = entering & left & !inside;
-            }
+            left = left & !self.plot.eq(nowhere);
+            entering = entering & left;
             if !left.any() {
                 break;
             }
-            let walking = left & !ready & !seeking;
+            let walking = left & !ready & !seeking & !entering;
             let (a, b, c) = (ready.count(), walking.count(), seeking.count());
+            let e = entering.count();
             // Now and then it is the turn of the few, or they would starve.
             turn = (turn + 1) % TURNS;
+            let to_enter = e > 0 && (turn == 2 || e > a.max(b).max(c));
             let to_seek = c > 0 && (turn == 0 || c > a && c > b);
             let to_walk = b > 0 && (turn == 1 || b > a);
-            if to_seek {
+            if to_enter {
+                let inside = self.enter(&mut soil, entering);
+                seeking = seeking | inside;
+                entering = entering & !inside;
+            } else if to_seek {
                 let (solid, found) = self.seek(&soil, seeking, &mut entering);
                 ready = ready | solid;
                 seeking = seeking & !found & !entering;
@@ -415,9 +421,9 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let inside = L::M::from_bits(inside);
         let passing = lanes & !inside;
         if passing.any() {
-            let corner = self.corner();
-            let (out, along_x) = self.exit(corner, L::I::splat(MAXIMA_LEVELS as i32));
-            self.enter_next(corner, out, along_x, passing);
+            let level = L::I::splat(MAXIMA_LEVELS as i32);
+            let (out, along_x) = self.exit(self.corner, level);
+            self.enter_next(out, along_x, passing);
         }
         let level = L::I::load(&soil.level);
         let top = L::I::splat(MAXIMA_LEVELS as i32) - level;
@@ -432,24 +438,10 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         inside
     }
 
-    /// Column and row of the lanes' plots.
-    #[inline(always)]
-    fn corner(&self) -> [L::I; 2] {
-        let mut plots = [NOWHERE; MOST];
-        self.plot.store(&mut plots);
-        let (mut columns, mut rows) = ([0; MOST], [0; MOST]);
-        for lane in 0..L::N {
-            columns[lane] = plots[lane].max(0) % self.relief.plots[0];
-            rows[lane] = plots[lane].max(0) / self.relief.plots[0];
-        }
-        [L::I::load(&columns), L::I::load(&rows)]
-    }
-
     /// The first cells of the plots; `top` as below.
     #[inline(always)]
     fn first(&self, top: L::I) -> [L::I; 2] {
-        let corner = self.corner();
-        [corner[0].shl(top), corner[1].shl(top)]
+        [self.corner[0].shl(top), self.corner[1].shl(top)]
     }
 
     /// Where lines leave the blocks of `1 << level` cells of level 0 that they are in, and
@@ -465,11 +457,12 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
 
     /// Puts lanes into the plot behind the line by which they leave theirs at `s`.
     #[inline(always)]
-    fn enter_next(&mut self, plot: [L::I; 2], s: L::F, along_x: L::M, lanes: L::M) {
+    fn enter_next(&mut self, s: L::F, along_x: L::M, lanes: L::M) {
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
         let [ahead_x, ahead_y] = self.lines.ahead;
-        let column = L::I::select(along_x, plot[0] + ahead_x + ahead_x - one, plot[0]);
-        let row = L::I::select(along_x, plot[1], plot[1] + ahead_y + ahead_y - one);
+        let [x, y] = self.corner;
+        let column = L::I::select(along_x, x + ahead_x + ahead_x - one, x);
+        let row = L::I::select(along_x, y, y + ahead_y + ahead_y - one);
         let columns = L::I::splat(self.relief.plots[0]);
         let rows = L::I::splat(self.relief.plots[1]);
         let inside = !column.lt(zero) & column.lt(columns) & !row.lt(zero) & row.lt(rows);
@@ -477,6 +470,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let number = row.times(columns) + column;
         let next = L::I::select(inside, number, L::I::splat(NOWHERE));
         self.plot = L::I::select(lanes, next, self.plot);
+        self.corner[0] = L::I::select(lanes, column, x);
+        self.corner[1] = L::I::select(lanes, row, y);
         self.free = L::F::select(lanes, s, self.free);
     }
 
@@ -523,7 +518,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let mut tired = walking & !leaving & L::I::splat(PATIENCE).lt(steps.passed);
         if (leaving | tired).any() {
             if leaving.any() {
-                self.enter_next(self.corner(), s, along_x, leaving);
+                self.enter_next(s, along_x, leaving);
                 *entering = *entering | leaving;
             }
             let top = L::I::splat(MAXIMA_LEVELS as i32) - L::I::load(&soil.level);
@@ -582,7 +577,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let outside = !before.shr(top).eq(after.shr(top)) | !out.lt(self.lines.leave);
         let leaving = clear & outside;
         if leaving.any() {
-            self.enter_next(self.corner(), out, along_x, leaving);
+            self.enter_next(out, along_x, leaving);
             *entering = *entering | leaving;
         }
         let moving = clear & !leaving;
@@ -813,15 +808,9 @@ impl Soils {
 const POSTS: usize = TILE_POSTS * TILE_POSTS + 1;
 const MAXIMA: usize = (TILE_CELLS * TILE_CELLS - 1) / 3 + 1;
 
-/// Floats as the bits that they are.
-pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
-    // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
-    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
-}
-
 /// Place of cells among the posts of their tile.
 #[inline(always)]
-fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
+pub(crate) fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
     let mask = L::I::splat(TILE_CELLS as i32 - 1);
     let ring = L::I::splat(TILE_RING as i32);
     let row = (cell[1] & mask) + ring;
@@ -830,7 +819,7 @@ fn post<L: Lanes>(cell: [L::I; 2]) -> L::I {
 
 /// Place of blocks of `1 << level` cells among the maxima of their tile; level from 1.
 #[inline(always)]
-fn maximum<L: Lanes>(block: [L::I; 2], level: L::I) -> L::I {
+pub(crate) fn maximum<L: Lanes>(block: [L::I; 2], level: L::I) -> L::I {
     // A tile has `1 << bits` blocks along a side. The levels of maxima lie one after
     // another, so those of this one begin behind (4^8 - 4^(bits + 1)) / 3 others; the
     // product is that third to the last unit.

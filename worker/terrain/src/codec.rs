@@ -22,7 +22,6 @@
 //! Decoding survives any bytes: every length is known before a buffer is made, and no
 //! tile is larger than [`MAX_TILE_BYTES`].
 
-use crate::color::linear_premultiplied;
 use crate::layout::{MAX_HEIGHT_M, STORE_VERSION, TILE_POSTS};
 use crate::planes::{self, PLANE_BYTES, Predictor};
 use crate::resident::Tile;
@@ -165,10 +164,9 @@ pub fn decode_heights(bytes: &[u8]) -> Result<HeightTile, CodecError> {
     HeightTile::new(posts.into_boxed_slice()).ok_or(CodecError::Length)
 }
 
-/// Decodes a photo for use: linear light, premultiplied by coverage.
+/// Decodes a photo for use.
 pub fn decode_photo(bytes: &[u8]) -> Result<PhotoTile, CodecError> {
-    let texels = decode_colors(bytes)?.into_iter().map(linear_premultiplied).collect();
-    PhotoTile::new(texels).ok_or(CodecError::Length)
+    PhotoTile::from_colors(&decode_colors(bytes)?).ok_or(CodecError::Length)
 }
 
 /// Decodes heights as they were given to [`encode_heights`].

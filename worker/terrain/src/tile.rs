@@ -4,8 +4,10 @@ use crate::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
 
 mod codes;
 mod maxima;
+mod photo;
 
 pub use maxima::{MAXIMA_LEVELS, MAXIMA_START};
+pub use photo::{FIELDS, PHOTO_TILE_BYTES, PhotoTile, TURNED, Texels};
 
 use maxima::{MAXIMA_COUNT, Sample, maxima_of};
 
@@ -80,10 +82,6 @@ impl Codes<'_> {
 /// of the posts for the maxima.
 pub const HEIGHT_TILE_BYTES: usize =
     size_of::<HeightTile>() + size_of::<f32>() * (TILE_POSTS * TILE_POSTS + MAXIMA_COUNT + 2);
-/// Bytes of a [`PhotoTile`] in memory.
-pub const PHOTO_TILE_BYTES: usize =
-    size_of::<PhotoTile>() + size_of::<[u16; 4]>() * TILE_POSTS * TILE_POSTS;
-
 impl Sample for u16 {
     const NOTHING: u16 = 0;
 
@@ -207,33 +205,6 @@ impl HeightTile {
     }
 }
 
-/// Colours of one tile of a photo, ready to be filtered: linear light, premultiplied by
-/// coverage, 65535 = 1.
-pub struct PhotoTile {
-    texels: Box<[[u16; 4]]>,
-}
-
-impl PhotoTile {
-    /// A tile from its texels (linear red, green, blue, coverage; premultiplied), row by
-    /// row from the south-west, ring included. `None` if their number is wrong.
-    pub fn new(texels: Box<[[u16; 4]]>) -> Option<Self> {
-        (texels.len() == TILE_POSTS * TILE_POSTS).then_some(PhotoTile { texels })
-    }
-
-    /// One texel. `i` and `j` from −1 to 257.
-    #[inline]
-    pub fn texel(&self, i: isize, j: isize) -> [u16; 4] {
-        let column = (i + TILE_RING as isize) as usize;
-        let row = (j + TILE_RING as isize) as usize;
-        self.texels[row * TILE_POSTS + column]
-    }
-
-    /// Bytes this tile takes in memory.
-    pub fn memory_bytes(&self) -> usize {
-        self.texels.len() * size_of::<[u16; 4]>() + size_of::<Self>()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -252,8 +223,6 @@ mod tests {
         assert_eq!(tile.post(-1, -1), -1001.0);
         assert_eq!(tile.post(257, 257), 257_257.0);
         assert_eq!(tile.corners(255, 0), [255.0, 256.0, 1255.0, 1256.0]);
-        let photo = PhotoTile::new(vec![[0; 4]; TILE_POSTS * TILE_POSTS].into()).unwrap();
-        assert_eq!(photo.memory_bytes(), PHOTO_TILE_BYTES);
     }
 
     #[test]
@@ -290,7 +259,6 @@ mod tests {
     #[test]
     fn a_wrong_number_of_posts_is_no_tile() {
         assert!(HeightTile::new(vec![0.0; 10].into()).is_none());
-        assert!(PhotoTile::new(vec![[0; 4]; 10].into()).is_none());
     }
 
     #[test]

@@ -85,7 +85,7 @@ impl Terrain {
         }
         let quality = Quality { samples_per_side, ..Quality::default() };
         let view = View { camera: grant.camera, shading: shading(), quality };
-        let rendered = render(&resident, &Pyramid::new(&self.index), &view, grant.region);
+        let rendered = render(&resident, &Pyramid::new(&self.index), &view, grant.region).unwrap();
         assert!(rendered.missing.is_empty());
         assert!(rendered.stats.hits > 0, "the test sees the ground");
         rendered.pixels

@@ -6,7 +6,7 @@ use std::time::Duration;
 use terrafarm_common::accuracy::PixelError;
 use terrafarm_common::id::BlobHash;
 use terrafarm_common::region::Region;
-use terrafarm_raycast::{Rendered, Stats, View};
+use terrafarm_raycast::{Rendered, Stats, Unfit, Unseen, View};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, accept};
@@ -171,11 +171,16 @@ impl Caster for Gated {
         region
     }
 
-    fn advance(&self, _: &Scene<()>, view: &View, _: &mut Region) -> Vec<TileKey> {
+    fn advance(
+        &self,
+        _: &Scene<()>,
+        view: &View,
+        _: &mut Region,
+    ) -> Result<Vec<TileKey>, Unfit> {
         assert!(view.quality.samples_per_side != 2, "two samples are too many");
         self.begun.send(()).unwrap();
         self.gate.lock().unwrap().recv().unwrap();
-        Vec::new()
+        Ok(Vec::new())
     }
 
     fn finish(&self, piece: Region) -> Rendered {
@@ -183,7 +188,7 @@ impl Caster for Gated {
         Rendered { pixels, missing: Vec::new(), stats: Stats::default() }
     }
 
-    fn gauge(&self, _: &Scene<()>, _: &View, _: u32, _: u32) -> Result<PixelError, Vec<TileKey>> {
+    fn gauge(&self, _: &Scene<()>, _: &View, _: u32, _: u32) -> Result<PixelError, Unseen> {
         Ok(PixelError { surface_px: 1.0, occlusion_px: 0.0, depth_m: None, mismatch: false })
     }
 }

@@ -222,7 +222,7 @@ impl Runs {
             (None, _) => self.first = Some(answer),
             (Some(Ok(first)), Ok(again)) => {
                 let bits = |depths: &[f32]| depths.iter().map(|d| d.to_bits()).collect::<Vec<_>>();
-                self.unsteady |= bits(&first.distance_m) != bits(&again.distance_m);
+                self.unsteady |= bits(&first.inverse_depth) != bits(&again.inverse_depth);
             }
             (Some(first), again) => self.unsteady |= first.is_ok() != again.is_ok(),
         }
@@ -268,7 +268,7 @@ fn judge(land: &Land, number: usize, stand: &Stand, mut runs: Runs) -> Case {
     };
     let pixels = f64::from(size[0]) * f64::from(size[1]);
     let seconds = median(&mut runs.seconds);
-    let ground = depths.distance_m.iter().filter(|distance| distance.is_finite()).count();
+    let ground = depths.inverse_depth.iter().filter(|&&inverse| inverse > 0.0).count();
     let mismatch = errors.mismatch();
     let spread = Spread::of(errors.error_px);
     let promise = Promise::of(quality.method, quality.tolerance_px);

@@ -4,7 +4,7 @@ use super::land::Land;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_raycast::meter::measure;
-use terrafarm_raycast::{Missing, View, cast, depths, render};
+use terrafarm_raycast::{Missing, Unfit, Unseen, View, cast, depths, render};
 
 pub use terrafarm_raycast::Depths;
 
@@ -21,6 +21,21 @@ impl From<Missing> for Refusal {
     }
 }
 
+impl From<Unfit> for Refusal {
+    fn from(unfit: Unfit) -> Self {
+        Refusal(unfit.to_string())
+    }
+}
+
+impl From<Unseen> for Refusal {
+    fn from(unseen: Unseen) -> Self {
+        match unseen {
+            Unseen::Missing(tiles) => Missing(tiles).into(),
+            Unseen::Unfit(unfit) => unfit.into(),
+        }
+    }
+}
+
 /// The distances of a whole picture.
 pub fn answer(land: &Land, view: &View) -> Result<Depths, Refusal> {
     answer_in(land, view, Region::whole(view.camera.width, view.camera.height))
@@ -33,7 +48,7 @@ pub fn answer_in(land: &Land, view: &View, region: Region) -> Result<Depths, Ref
 
 /// The pixels of a region, shaded: three bytes of sRGB each.
 pub fn picture(land: &Land, view: &View, region: Region) -> Result<Vec<u8>, Refusal> {
-    let rendered = render(&land.resident, &land.pyramid, view, region);
+    let rendered = render(&land.resident, &land.pyramid, view, region)?;
     if rendered.missing.is_empty() {
         Ok(rendered.pixels)
     } else {
@@ -68,9 +83,9 @@ pub fn errors(
     let mut errors = Errors { error_px: Vec::new(), mismatched: 0 };
     for row in along(region.height) {
         for column in along(region.width) {
-            let claimed = answer.distance_m[row as usize * region.width as usize + column as usize];
             let (x, y) = (region.x + column, region.y + row);
-            let pixel = measure(&land.resident, &land.pyramid, view, x, y, f64::from(claimed))?;
+            let claimed = answer.distance_m(view, x, y);
+            let pixel = measure(&land.resident, &land.pyramid, view, x, y, claimed)?;
             errors.error_px.push(pixel.error_px());
             errors.mismatched += usize::from(pixel.mismatch);
         }
@@ -84,15 +99,13 @@ pub fn from_reference(land: &Land, view: &View, answer: &Depths) -> Result<Vec<f
     let quality = Quality { method: Method::Reference, ..view.quality };
     let truth = View { quality, ..view.clone() };
     let focal_px = view.camera.focal_px();
-    let mut errors = Vec::with_capacity(answer.distance_m.len());
-    for (at, &claimed) in (0u32..).zip(&answer.distance_m) {
-        let (x, y) = (at % view.camera.width, at / view.camera.width);
+    let mut errors = Vec::with_capacity(answer.inverse_depth.len());
+    for [x, y] in answer.region.pixels() {
         let place = [x, y].map(|pixel| f64::from(pixel) + 0.5);
         let seen = cast(&land.resident, &land.pyramid, &truth, place[0], place[1])?;
-        let claimed = f64::from(claimed);
+        let claimed = answer.distance_m(view, x, y);
         errors.push(match seen {
             None if claimed.is_infinite() => 0.0,
-            Some(hit) if hit.distance_m == claimed => 0.0,
             Some(hit) if claimed.is_finite() => {
                 (hit.distance_m - claimed).abs() / hit.distance_m * focal_px
             }

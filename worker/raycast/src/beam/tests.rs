@@ -4,8 +4,8 @@ use super::{Beams, WIDEST_PX};
 use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
 use crate::oracle::{Dice, Land, lands};
+use crate::painter::{path, squares};
 use crate::path::Ground;
-use crate::progress::{path, squares};
 use crate::tests_support::{Plan, mountains, noise};
 use crate::{View, render};
 use glam::DVec3;
@@ -119,7 +119,7 @@ fn the_tiles_that_a_picture_needs_count_as_used() {
         let frame = Region::whole(SIZE.0, SIZE.1);
         let mut resident = land.resident.clone();
         resident.next_round();
-        let picture = render(&resident, &land.pyramid, &view, frame);
+        let picture = render(&resident, &land.pyramid, &view, frame).expect("exact fits");
         // Tiles of one age go in the order of keys, unused ones before used ones.
         let order = resident.clone().evict_to(0);
         let Some(last_unused) = order.windows(2).position(|pair| pair[0] > pair[1]) else {
@@ -128,7 +128,7 @@ fn the_tiles_that_a_picture_needs_count_as_used() {
         for &unused in &order[..=last_unused] {
             resident.remove(unused);
         }
-        let again = render(&resident, &land.pyramid, &view, frame);
+        let again = render(&resident, &land.pyramid, &view, frame).expect("exact fits");
         assert_eq!(again.missing, []);
         assert_eq!(again.pixels, picture.pixels);
         told_apart += 1;
@@ -143,6 +143,7 @@ fn beams_over_a_single_post_end() {
     let mut view = view(&land, &mut Dice::new(1));
     view.camera.position = DVec3::new(0.0, -300.0, 700.0);
     view.shading.earth = None;
-    let rendered = render(&land.resident, &land.pyramid, &view, Region::whole(SIZE.0, SIZE.1));
+    let whole = Region::whole(SIZE.0, SIZE.1);
+    let rendered = render(&land.resident, &land.pyramid, &view, whole).expect("exact fits");
     assert_eq!((rendered.stats.hits, rendered.missing.len()), (0, 0));
 }

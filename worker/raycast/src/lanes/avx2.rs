@@ -5,6 +5,8 @@
 //! take slices that were checked to be long enough, gathers indices that were brought
 //! inside their table.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -25,6 +27,7 @@ impl Lanes for Eight {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -139,6 +142,11 @@ impl Floats for F {
         unsafe { F(_mm256_castsi256_ps(bits.0)) }
     }
     #[inline(always)]
+    fn to_bits(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_castps_si256(self.0)) }
+    }
+    #[inline(always)]
     fn lookup(table: &[f32], at: I) -> F {
         let table = &table[..16];
         // SAFETY: see the page of this module.
@@ -227,6 +235,17 @@ impl Ints for I {
         }
     }
     #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+            let none = _mm256_setzero_si256();
+            let mask = _mm256_castps_si256(mask.0);
+            I(_mm256_mask_i32gather_epi32::<2>(none, table.as_ptr().cast(), at, mask))
+        }
+    }
+    #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
         let last = (table.len().min(i32::MAX as usize) - 1) as i32;
         // SAFETY: see the page of this module.
@@ -236,6 +255,45 @@ impl Ints for I {
             let mask = _mm256_castps_si256(mask.0);
             I(_mm256_mask_i32gather_epi32::<4>(none, table.as_ptr().cast(), at, mask))
         }
+    }
+    #[inline(always)]
+    fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
+    }
+    #[inline(always)]
+    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
+        // SAFETY: see the page of this module; element `last + 3` is inside the table.
+        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    }
+}
+
+/// Eight bytes a lane from a table of elements of `SIZE` bytes; their low and high halves.
+///
+/// # Safety
+/// As every block here; and eight bytes from element `last` on must be readable.
+#[inline(always)]
+unsafe fn gather_eights<const SIZE: i32>(table: *const i64, at: I, last: i32, mask: M) -> (I, I) {
+    // SAFETY: by this function's own condition.
+    unsafe {
+        let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
+        let mask = _mm256_castps_si256(mask.0);
+        let none = _mm256_setzero_si256();
+        let few = _mm256_cvtepi32_epi64(_mm256_castsi256_si128(mask));
+        let rest = _mm256_cvtepi32_epi64(_mm256_extracti128_si256::<1>(mask));
+        let (start, end) = (_mm256_castsi256_si128(at), _mm256_extracti128_si256::<1>(at));
+        let first = _mm256_mask_i32gather_epi64::<SIZE>(none, table, start, few);
+        let second = _mm256_mask_i32gather_epi64::<SIZE>(none, table, end, rest);
+        let (first, second) = (_mm256_castsi256_ps(first), _mm256_castsi256_ps(second));
+        // Halves of four bytes next to each other, then in the order of the lanes.
+        let low = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(first, second));
+        let high = _mm256_castps_si256(_mm256_shuffle_ps::<0b11_01_11_01>(first, second));
+        (
+            I(_mm256_permute4x64_epi64::<0b11_01_10_00>(low)),
+            I(_mm256_permute4x64_epi64::<0b11_01_10_00>(high)),
+        )
     }
 }
 

@@ -2,6 +2,8 @@
 //!
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
+mod doubles;
+
 use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
@@ -21,6 +23,7 @@ impl Lanes for Sixteen {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 /// # Safety
@@ -149,6 +152,11 @@ impl Floats for F {
         unsafe { F(_mm512_castsi512_ps(bits.0)) }
     }
     #[inline(always)]
+    fn to_bits(self) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_castps_si512(self.0)) }
+    }
+    #[inline(always)]
     fn lookup(table: &[f32], at: I) -> F {
         let table = &table[..32];
         // SAFETY: see the page of this module.
@@ -222,6 +230,16 @@ impl Ints for I {
         }
     }
     #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe {
+            let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+            let none = _mm512_setzero_si512();
+            I(_mm512_mask_i32gather_epi32::<2>(none, mask.0, at, table.as_ptr().cast()))
+        }
+    }
+    #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
         let last = (table.len().min(i32::MAX as usize) - 1) as i32;
         // SAFETY: see the page of this module.
@@ -230,6 +248,41 @@ impl Ints for I {
             let none = _mm512_setzero_si512();
             I(_mm512_mask_i32gather_epi32::<4>(none, mask.0, at, table.as_ptr().cast()))
         }
+    }
+    #[inline(always)]
+    fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        // SAFETY: see the page of this module; element `last + 1` is inside the table.
+        unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
+    }
+    #[inline(always)]
+    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
+        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
+        // SAFETY: see the page of this module; element `last + 3` is inside the table.
+        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    }
+}
+
+/// Eight bytes a lane from a table of elements of `SIZE` bytes; their low and high halves.
+///
+/// # Safety
+/// As every block here; and eight bytes from element `last` on must be readable.
+#[inline(always)]
+unsafe fn gather_eights<const SIZE: i32>(table: *const i64, at: I, last: i32, mask: M) -> (I, I) {
+    // SAFETY: by this function's own condition.
+    unsafe {
+        let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
+        let none = _mm512_setzero_si512();
+        let (first, second) = (_mm512_castsi512_si256(at), _mm512_extracti64x4_epi64::<1>(at));
+        let (few, rest) = (mask.0 as u8, (mask.0 >> 8) as u8);
+        let first = _mm512_mask_i32gather_epi64::<SIZE>(none, few, first, table);
+        let second = _mm512_mask_i32gather_epi64::<SIZE>(none, rest, second, table);
+        let low = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let high = _mm512_add_epi32(low, _mm512_set1_epi32(1));
+        (
+            I(_mm512_permutex2var_epi32(first, low, second)),
+            I(_mm512_permutex2var_epi32(first, high, second)),
+        )
     }
 }
 

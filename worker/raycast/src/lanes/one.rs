@@ -1,5 +1,7 @@
 //! A single lane: the scalar twin of every kernel.
 
+mod doubles;
+
 use super::{Floats, Ints, Lanes, MOST, Mask};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -18,6 +20,7 @@ impl Lanes for One {
     type F = F;
     type I = I;
     type M = M;
+    type D = doubles::D;
 }
 
 macro_rules! operator {
@@ -124,6 +127,10 @@ impl Floats for F {
         F(f32::from_bits(bits.0 as u32))
     }
     #[inline(always)]
+    fn to_bits(self) -> I {
+        I(self.0.to_bits() as i32)
+    }
+    #[inline(always)]
     fn lookup(table: &[f32], at: I) -> F {
         F(table[..2][at.0 as usize & 1])
     }
@@ -197,11 +204,33 @@ impl Ints for I {
         I(unsafe { bases[0].add(at).cast::<i32>().read_unaligned() })
     }
     #[inline(always)]
+    fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
+        if !mask.0 {
+            return I(0);
+        }
+        let at = (at.0 as u32 as usize).min(table.len() - 2);
+        I((u32::from(table[at]) | u32::from(table[at + 1]) << 16) as i32)
+    }
+    #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
         if !mask.0 {
             return I(0);
         }
         I(table[(at.0 as u32 as usize).min(table.len() - 1)] as i32)
+    }
+    #[inline(always)]
+    fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
+        if !mask.0 {
+            return (I(0), I(0));
+        }
+        let at = (at.0 as u32 as usize).min(table.len() - 2);
+        (I(table[at] as i32), I(table[at + 1] as i32))
+    }
+    #[inline(always)]
+    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
+        let at = I((at.0 as u32 as usize).min(table.len() - 4) as i32);
+        let next = I(at.0 + 2);
+        (Self::gather_pairs(table, at, mask), Self::gather_pairs(table, next, mask))
     }
 }
 

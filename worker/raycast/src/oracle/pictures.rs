@@ -112,7 +112,7 @@ fn a_frame_is_the_same_whatever_the_order_in_which_tiles_come() {
         let mut rounds = 0;
         let mut given: Vec<TileKey> = Vec::new();
         while !progress.is_done() {
-            let missing = progress.advance(&resident, &land.pyramid, &view);
+            let missing = progress.advance(&resident, &land.pyramid, &view).expect("exact fits");
             assert_eq!(missing.is_empty(), progress.is_done());
             if missing.is_empty() {
                 break;

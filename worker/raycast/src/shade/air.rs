@@ -1,7 +1,10 @@
 //! Haze between the camera and the ground, and the sky behind.
 
-use glam::DVec3;
-use terrafarm_common::shading::{Haze, LinearRgb, Shading, Sun};
+use super::exp::exp;
+use super::ray::Ray;
+use super::slope::lerp;
+use crate::lanes::{Floats, Lanes};
+use terrafarm_common::shading::{LinearRgb, Shading};
 
 /// Contrast falls to 2 % at the visibility: 3.912 = -ln 0.02 (Koschmieder).
 const KOSCHMIEDER: f64 = 3.912;
@@ -9,94 +12,149 @@ const KOSCHMIEDER: f64 = 3.912;
 const UNIFORM_LAYER_M: f64 = 1500.0;
 /// Sine of the elevation that is added so that the layer is not infinitely deep at the
 /// horizon.
-const HORIZON_SINE: f64 = 0.01;
+const HORIZON_SINE: f32 = 0.01;
 /// 1 - cosine of the apparent radius of the sun, 0.267 degrees.
-const SUN_DISC: f64 = 1.086e-5;
+const SUN_DISC: f32 = 1.086e-5;
 /// Light of the sun's disc and of the two glows around it, as shares of full light.
 const SUN_COLOR: [f32; 3] = [1.0, 0.93, 0.80];
+/// Of the narrow and the wide glow around the sun: light at its middle, and how fast it
+/// falls.
+const GLOWS: [(f32, f32); 2] = [(0.35, 900.0), (0.08, 15.0)];
+/// Exponents below which the mean over a slanted way is a series.
+const FLAT_WAY: f32 = 0.05;
 
 /// The air of a scene as seen from one place.
-pub(crate) struct Air<'s> {
-    shading: &'s Shading,
-    /// Extinction at the height of the camera, per metre.
-    extinction: f64,
-    camera_z: f64,
+pub(crate) struct Air {
+    horizon: LinearRgb,
+    /// Zenith less horizon.
+    higher: LinearRgb,
     haze: Option<Haze>,
+    /// Direction of the sun, if it is up.
+    sun: Option<[f32; 3]>,
 }
 
-impl<'s> Air<'s> {
+struct Haze {
+    color: LinearRgb,
+    /// Extinction at the height of the camera, per metre.
+    extinction: f32,
+    /// Extinction of the whole layer above the camera.
+    layer: f32,
+    /// 1 / scale height, per metre; 0 for a haze that is the same everywhere.
+    thinning: f32,
+}
+
+impl Air {
     /// `lowest_z` is the height at which the visibility holds: the lowest ground.
-    pub(crate) fn new(shading: &'s Shading, lowest_z: f64, camera_z: f64) -> Self {
-        let haze = shading.haze.filter(|haze| haze.visibility_m > 0.0);
-        let extinction = haze.map_or(0.0, |haze| {
-            let above = if haze.scale_height_m > 0.0 {
-                (camera_z - lowest_z) / haze.scale_height_m
-            } else {
-                0.0
-            };
-            KOSCHMIEDER / haze.visibility_m * libm::exp(-above.clamp(-50.0, 700.0))
+    pub(crate) fn new(shading: &Shading, lowest_z: f64, camera_z: f64) -> Self {
+        let haze = shading.haze.filter(|haze| haze.visibility_m > 0.0).map(|haze| {
+            let thins = haze.scale_height_m > 0.0;
+            let above = if thins { (camera_z - lowest_z) / haze.scale_height_m } else { 0.0 };
+            let extinction =
+                KOSCHMIEDER / haze.visibility_m * libm::exp(-above.clamp(-50.0, 700.0));
+            let depth = if thins { haze.scale_height_m } else { UNIFORM_LAYER_M };
+            Haze {
+                color: haze.color,
+                extinction: extinction as f32,
+                layer: (extinction * depth) as f32,
+                thinning: if thins { (1.0 / haze.scale_height_m) as f32 } else { 0.0 },
+            }
         });
-        Air { shading, extinction, camera_z, haze }
+        let sky = &shading.sky;
+        let sun = shading.sun.filter(|sun| sun.direction.z > 0.0);
+        Air {
+            horizon: sky.horizon,
+            higher: [0, 1, 2].map(|c| sky.zenith[c] - sky.horizon[c]),
+            haze,
+            sun: sun.map(|sun| sun.direction.as_vec3().to_array()),
+        }
     }
 
-    /// Light from ground at a distance and height, after the air between.
-    pub(crate) fn veil(
+    /// Light from ground at a distance and a height over the camera, after the air between.
+    #[inline(always)]
+    pub(crate) fn veil<L: Lanes>(
         &self,
-        ground: LinearRgb,
-        view: DVec3,
-        distance_m: f64,
-        z: f64,
-    ) -> LinearRgb {
-        let Some(haze) = self.haze else { return ground };
-        // The integral of exp(-h / H) along a line is its length times the mean of
-        // exp over the two ends' exponents, (1 - exp(-x)) / x for their difference x.
-        let mean = if haze.scale_height_m > 0.0 {
-            let x = ((z - self.camera_z) / haze.scale_height_m).clamp(-700.0, 700.0);
-            if x.abs() < 1e-5 { 1.0 - 0.5 * x } else { (1.0 - libm::exp(-x)) / x }
-        } else {
-            1.0
-        };
-        let clear = libm::exp(-(self.extinction * distance_m * mean).min(700.0)) as f32;
-        let glow = self.glow(view);
-        let veiled = |c: usize| ground[c] * clear + (haze.color[c] + glow[c]) * (1.0 - clear);
-        [veiled(0), veiled(1), veiled(2)]
+        ground: [L::F; 3],
+        ray: &Ray<L>,
+        distance_m: L::F,
+        over: L::F,
+    ) -> [L::F; 3] {
+        let Some(haze) = &self.haze else { return ground };
+        let mut depth = L::F::splat(-haze.extinction) * distance_m;
+        if haze.thinning > 0.0 {
+            // The integral of exp(-h / H) along a line is its length times the mean of
+            // exp over the two ends' exponents, (1 - exp(-x)) / x for their difference x,
+            // or the like with the ends exchanged, so that x is not below zero.
+            let one = L::F::splat(1.0);
+            let zero = L::F::splat(0.0);
+            let rise = over * L::F::splat(haze.thinning);
+            let x = rise.abs();
+            let fall = exp::<L>(-x);
+            let long = (one - fall).div(x);
+            let series = one - x * (L::F::splat(0.5)
+                - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
+            let mean = L::F::select(x.lt(L::F::splat(FLAT_WAY)), series, long);
+            depth = depth * L::F::select(rise.lt(zero), mean.div(fall), mean);
+        }
+        let clear = exp::<L>(depth);
+        let glow = self.glow(ray);
+        let mut veiled = ground;
+        for c in 0..3 {
+            let air = L::F::splat(haze.color[c]) + glow * L::F::splat(SUN_COLOR[c]);
+            veiled[c] = lerp::<L>(air, ground[c], clear);
+        }
+        veiled
     }
 
     /// The sky in a direction. Below the horizon it is what the horizon is.
-    pub(crate) fn sky(&self, view: DVec3) -> LinearRgb {
-        let sine = view.z.max(0.0);
-        let sky = &self.shading.sky;
-        let up = sine.sqrt() as f32;
-        let mut color = [0, 1, 2].map(|c| sky.horizon[c] + (sky.zenith[c] - sky.horizon[c]) * up);
-        if let Some(haze) = self.haze {
-            let layer =
-                if haze.scale_height_m > 0.0 { haze.scale_height_m } else { UNIFORM_LAYER_M };
-            let depth = self.extinction * layer / (sine + HORIZON_SINE);
+    #[inline(always)]
+    pub(crate) fn sky<L: Lanes>(&self, ray: &Ray<L>) -> [L::F; 3] {
+        let zero = L::F::splat(0.0);
+        let sine = ray.view[2].max(zero);
+        let up = sine.sqrt();
+        let mut clear = L::F::splat(1.0);
+        if let Some(haze) = &self.haze {
+            let depth = L::F::splat(-haze.layer).div(sine + L::F::splat(HORIZON_SINE));
             // Just below the horizon all is haze, just above it nearly so.
-            let clear = if view.z > 0.0 { libm::exp(-depth.min(700.0)) as f32 } else { 0.0 };
-            color = [0, 1, 2].map(|c| color[c] * clear + haze.color[c] * (1.0 - clear));
+            clear = L::F::select(zero.lt(ray.view[2]), exp::<L>(depth), zero);
         }
-        let glow = self.glow(view);
-        let disc = self.disc(view);
-        [0, 1, 2].map(|c| color[c] + glow[c] + disc * SUN_COLOR[c])
+        let sun = self.glow(ray) + self.disc(ray);
+        let mut color = [zero; 3];
+        for c in 0..3 {
+            let bare = L::F::splat(self.horizon[c]) + L::F::splat(self.higher[c]) * up;
+            let veil = self.haze.as_ref().map_or(0.0, |haze| haze.color[c]);
+            color[c] = lerp::<L>(L::F::splat(veil), bare, clear) + sun * L::F::splat(SUN_COLOR[c]);
+        }
+        color
     }
 
     /// Light scattered around the sun: a narrow and a wide glow.
-    fn glow(&self, view: DVec3) -> LinearRgb {
-        let Some(sun) = self.sun_above() else { return [0.0; 3] };
-        let away = 1.0 - view.dot(sun.direction);
-        let light = (0.35 / (1.0 + 900.0 * away) + 0.08 / (1.0 + 15.0 * away)) as f32;
-        SUN_COLOR.map(|color| color * light)
+    #[inline(always)]
+    fn glow<L: Lanes>(&self, ray: &Ray<L>) -> L::F {
+        let Some(sun) = self.sun else { return L::F::splat(0.0) };
+        let away = away::<L>(sun, ray);
+        let one = L::F::splat(1.0);
+        let [(near, steep), (wide, flat)] = GLOWS;
+        let steep = one + L::F::splat(steep) * away;
+        let flat = one + L::F::splat(flat) * away;
+        (L::F::splat(near) * flat + L::F::splat(wide) * steep).div(steep * flat)
     }
 
-    fn disc(&self, view: DVec3) -> f32 {
-        let Some(sun) = self.sun_above().filter(|_| view.z > 0.0) else { return 0.0 };
-        let away = 1.0 - view.dot(sun.direction);
-        let edge = ((1.25 * SUN_DISC - away) / (0.5 * SUN_DISC)).clamp(0.0, 1.0) as f32;
-        edge * edge * (3.0 - 2.0 * edge)
+    #[inline(always)]
+    fn disc<L: Lanes>(&self, ray: &Ray<L>) -> L::F {
+        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
+        let Some(sun) = self.sun else { return zero };
+        let edge = L::F::splat(1.25 * SUN_DISC) - away::<L>(sun, ray);
+        let edge = (edge * L::F::splat(2.0 / SUN_DISC)).max(zero).min(one);
+        let disc = edge * edge * (L::F::splat(3.0) - edge - edge);
+        L::F::select(zero.lt(ray.view[2]), disc, zero)
     }
+}
 
-    fn sun_above(&self) -> Option<Sun> {
-        self.shading.sun.filter(|sun| sun.direction.z > 0.0)
-    }
+/// 1 - the cosine of the angle to the sun, exact also close to it.
+#[inline(always)]
+fn away<L: Lanes>(sun: [f32; 3], ray: &Ray<L>) -> L::F {
+    let x = ray.view[0] - L::F::splat(sun[0]);
+    let y = ray.view[1] - L::F::splat(sun[1]);
+    let z = ray.view[2] - L::F::splat(sun[2]);
+    (x * x + y * y + z * z) * L::F::splat(0.5)
 }

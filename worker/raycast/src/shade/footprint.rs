@@ -1,116 +1,140 @@
-//! The ground that a pixel covers: an ellipse on the map.
+//! The ground that a pixel covers: an ellipse on the map, and the strip of texels that
+//! stands for it.
 
-use glam::{DVec2, DVec3};
+use crate::lanes::{Floats, Lanes};
 
 /// The widest stretch of a footprint by a slanted view. Steeper views of a wall would
 /// smear a pixel over the whole map.
-const MAX_STRETCH: f64 = 64.0;
+const MAX_STRETCH: f32 = 64.0;
 
-/// The two sides of a pixel, laid on the ground.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Footprint {
-    sides: [DVec2; 2],
+/// The two sides of a pixel, laid on the ground: metres along x and y.
+pub(crate) struct Footprint<L: Lanes> {
+    sides: [[L::F; 2]; 2],
 }
 
-/// An ellipse by its axes.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Axes {
-    /// The long axis, whole length, as a vector.
-    pub major: DVec2,
-    /// Length of the long axis.
-    pub major_length: f64,
-    /// Length of the short axis.
-    pub minor_length: f64,
+/// Samples in a row: along x or y, whichever the ellipse is longer along, and along the
+/// other axis so much a sample as the ellipse slants.
+pub(crate) struct Strip<L: Lanes> {
+    /// The row runs along x.
+    pub along_x: L::M,
+    /// Extent along the axis of the row, in samples.
+    pub length: L::F,
+    /// Samples along the other axis per sample along this.
+    pub slant: L::F,
+    /// Lengths of the long and the short axis of the ellipse, in samples.
+    pub major: L::F,
+    pub minor: L::F,
 }
 
-impl Footprint {
-    /// Lays the sides of a pixel (vectors across the view, metres) along the unit vector
-    /// `view` onto ground of the given slopes.
-    pub(crate) fn new(sides: [DVec3; 2], view: DVec3, slopes: [f64; 2]) -> Self {
-        let normal = DVec3::new(-slopes[0], -slopes[1], 1.0);
-        let facing = view.dot(normal).min(-normal.length() / MAX_STRETCH);
-        let sides = sides.map(|side| {
-            let along = -side.dot(normal) / facing;
-            (side + view * along).truncate()
-        });
-        Footprint { sides }
-    }
-
-    /// The axes in units of `spacing` along x and y.
-    pub(crate) fn axes(&self, spacing: [f64; 2]) -> Axes {
-        let scale = DVec2::new(1.0 / spacing[0], 1.0 / spacing[1]);
-        let [a, b] = self.sides.map(|side| side * scale);
-        // Eigenvalues of the sum of a a^T and b b^T.
-        let (xx, yy, xy) = (a.x * a.x + b.x * b.x, a.y * a.y + b.y * b.y, a.x * a.y + b.x * b.y);
-        let (half_sum, half_difference) = (0.5 * (xx + yy), 0.5 * (xx - yy));
-        let root = (half_difference * half_difference + xy * xy).sqrt();
-        let major_length = (half_sum + root).sqrt();
-        if !major_length.is_normal() {
-            return Axes { major: DVec2::ZERO, major_length: 0.0, minor_length: 0.0 };
+impl<L: Lanes> Footprint<L> {
+    /// Lays the sides of a pixel (unit vectors to its right and top, and their length)
+    /// along the unit vector `view` onto ground of the given slopes.
+    #[inline(always)]
+    pub(crate) fn new(
+        sides: [[f32; 3]; 2],
+        length: L::F,
+        view: [L::F; 3],
+        slopes: [L::F; 2],
+    ) -> Self {
+        // The normal is (-slopes, 1).
+        let steep = (slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0)).sqrt();
+        let facing = view[2] - view[0] * slopes[0] - view[1] * slopes[1];
+        let facing = facing.min(-steep * L::F::splat(1.0 / MAX_STRETCH));
+        let reach = length.div(facing);
+        Footprint {
+            sides: [
+                lay::<L>(sides[0], length, reach, view, slopes),
+                lay::<L>(sides[1], length, reach, view, slopes),
+            ],
         }
-        // An eigenvector has two forms; the one without cancellation is taken.
-        let eigenvector = if half_difference >= 0.0 {
-            DVec2::new(half_difference + root, xy)
-        } else {
-            DVec2::new(xy, root - half_difference)
-        };
-        let length = eigenvector.length();
-        let direction = if length > 0.0 { eigenvector / length } else { DVec2::X };
-        let area = (a.x * b.y - a.y * b.x).abs();
-        Axes { major: direction * major_length, major_length, minor_length: area / major_length }
+    }
+
+    /// The strip for samples so many a metre along x and y.
+    #[inline(always)]
+    pub(crate) fn strip(&self, rate: [f32; 2]) -> Strip<L> {
+        let (rx, ry) = (L::F::splat(rate[0]), L::F::splat(rate[1]));
+        let (ax, ay) = (self.sides[0][0] * rx, self.sides[0][1] * ry);
+        let (bx, by) = (self.sides[1][0] * rx, self.sides[1][1] * ry);
+        // Eigenvalues of the sum of a a^T and b b^T.
+        let (xx, yy, xy) = (ax * ax + bx * bx, ay * ay + by * by, ax * ay + bx * by);
+        let half = L::F::splat(0.5);
+        let (half_sum, half_difference) = ((xx + yy) * half, (xx - yy) * half);
+        let root = (half_difference * half_difference + xy * xy).sqrt();
+        // What is no number or too small to be one is round and of no size.
+        let square = (half_sum + root).max(L::F::splat(1e-20));
+        let major = square.sqrt();
+        let minor = (ax * by - ay * bx).abs().div(major);
+        // The eigenvector of the long axis, its larger part first.
+        let long = (half_difference.abs() + root).max(L::F::splat(1e-20));
+        let slant = xy.div(long);
+        let length = major.div((L::F::splat(1.0) + slant * slant).sqrt());
+        Strip { along_x: L::F::splat(0.0).le(half_difference), length, slant, major, minor }
     }
 }
 
-/// A size in samples as a level of a pyramid and the share of the next coarser one: sizes
-/// 2^n (1 + w) give (n, w), sizes below 1 give (0, 0).
-#[inline]
-pub(crate) fn level_of(size: f64, last: usize) -> (usize, f32) {
-    if size < 1.0 || size.is_nan() {
-        return (0, 0.0);
-    }
-    let bits = size.to_bits();
-    let level = (bits >> 52) as usize - 1023;
-    if level >= last {
-        return (last, 0.0);
-    }
-    let mantissa = f64::from_bits(bits & ((1 << 52) - 1) | (1023 << 52));
-    (level, (mantissa - 1.0) as f32)
+/// One side on the ground.
+#[inline(always)]
+fn lay<L: Lanes>(
+    side: [f32; 3],
+    length: L::F,
+    reach: L::F,
+    view: [L::F; 3],
+    slopes: [L::F; 2],
+) -> [L::F; 2] {
+    let (x, y) = (L::F::splat(side[0]), L::F::splat(side[1]));
+    let along = (slopes[0] * x + slopes[1] * y - L::F::splat(side[2])) * reach;
+    [x * length + view[0] * along, y * length + view[1] * along]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lanes::{Mask, One};
+
+    /// Along x, length, slant, major, minor.
+    fn strip(sides: [[f32; 3]; 2], size: f32, view: [f32; 3], slopes: [f32; 2]) -> (bool, [f32; 4]) {
+        let view = view.map(Floats::splat);
+        let slopes = slopes.map(Floats::splat);
+        let footprint = Footprint::<One>::new(sides, Floats::splat(size), view, slopes);
+        let strip = footprint.strip([1.0, 1.0]);
+        let values = [strip.length, strip.slant, strip.major, strip.minor].map(|value| {
+            let mut out = [0.0];
+            value.store(&mut out);
+            out[0]
+        });
+        (strip.along_x.any(), values)
+    }
 
     #[test]
     fn a_pixel_seen_from_straight_above_is_round() {
-        let footprint = Footprint::new([DVec3::X * 2.0, DVec3::Y * 2.0], DVec3::NEG_Z, [0.0, 0.0]);
-        let axes = footprint.axes([1.0, 1.0]);
-        assert!((axes.major_length - 2.0).abs() < 1e-12 && (axes.minor_length - 2.0).abs() < 1e-12);
+        let sides = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+        let (_, [length, slant, major, minor]) = strip(sides, 2.0, [0.0, 0.0, -1.0], [0.0; 2]);
+        assert_eq!([length, slant, major, minor], [2.0, 0.0, 2.0, 2.0]);
+        let (_, [length, _, major, minor]) = strip(sides, 0.0, [0.0, 0.0, -1.0], [0.0; 2]);
+        assert!(length < 1e-9 && major < 1e-9 && minor == 0.0);
     }
 
     #[test]
     fn a_slanted_view_stretches_along_the_view_whatever_the_roll() {
-        let (sin, cos) = (0.1, (1.0f64 - 0.01).sqrt());
-        let view = DVec3::new(cos, 0.0, -sin);
-        let (right, up) = (DVec3::NEG_Y, DVec3::new(sin, 0.0, cos));
-        for roll in [0.0, 0.3, 0.8, 1.5] {
-            let (s, c) = (libm::sin(roll), libm::cos(roll));
-            let sides = [right * c + up * s, up * c - right * s];
-            let axes = Footprint::new(sides, view, [0.0, 0.0]).axes([1.0, 1.0]);
-            assert!((axes.major_length - 10.0).abs() < 1e-9, "{axes:?}");
-            assert!((axes.minor_length - 1.0).abs() < 1e-9, "{axes:?}");
-            assert!((axes.major.x.abs() - 10.0).abs() < 1e-9 && axes.major.y.abs() < 1e-9);
+        let (sin, cos) = (0.1f32, 0.994_987_43f32);
+        for (heading, x) in [(0.0f64, true), (0.5, true), (1.2, false), (2.0, false), (3.0, true)] {
+            let (hs, hc) = (libm::sin(heading) as f32, libm::cos(heading) as f32);
+            let view = [cos * hc, cos * hs, -sin];
+            let (right, up) = ([hs, -hc, 0.0], [sin * hc, sin * hs, cos]);
+            for roll in [0.0f64, 0.3, 0.8, 1.5] {
+                let (s, c) = (libm::sin(roll) as f32, libm::cos(roll) as f32);
+                let mix = |a: [f32; 3], p: f32, b: [f32; 3], q: f32| {
+                    [0, 1, 2].map(|n| a[n] * p + b[n] * q)
+                };
+                let sides = [mix(right, c, up, s), mix(up, c, right, -s)];
+                let (along_x, [length, slant, major, minor]) =
+                    strip(sides, 1.0, view, [0.0, 0.0]);
+                assert!((major - 10.0).abs() < 1e-4 && (minor - 1.0).abs() < 1e-4);
+                assert_eq!(along_x, x, "{heading}");
+                let (longer, shorter) = if x { (hc, hs) } else { (hs, hc) };
+                assert!((slant - shorter / longer).abs() < 1e-4, "{heading} {slant}");
+                assert!((length - 10.0 * longer.abs()).abs() < 1e-3, "{heading} {length}");
+            }
         }
-    }
-
-    #[test]
-    fn levels_are_continuous_in_size() {
-        assert_eq!(level_of(0.3, 5), (0, 0.0));
-        assert_eq!(level_of(1.0, 5), (0, 0.0));
-        assert_eq!(level_of(3.0, 5), (1, 0.5));
-        assert_eq!(level_of(1e9, 5), (5, 0.0));
-        assert_eq!(level_of(f64::NAN, 5), (0, 0.0));
-        assert_eq!(level_of(f64::INFINITY, 5), (5, 0.0));
-        assert_eq!(level_of(7.0, 0), (0, 0.0));
     }
 }

@@ -346,7 +346,9 @@ fn photos_keep_their_colors_and_fade_into_nothing() {
     assert_eq!(texel(0, -1), [0; 4]);
     assert_eq!(texel(1, 49), texel(0, 99));
     // Post 50 lies over 99, 100 and 101: a quarter of the weight is covered.
-    assert_eq!(texel(1, 50), crate::color::linear_premultiplied([10, 200, 30, 64]));
+    let faded = crate::color::linear_premultiplied([10, 200, 30, 64]);
+    let kept = |c: usize| texel(1, 50)[c].abs_diff(faded[c]) < 10;
+    assert!((0..4).all(kept), "{:?} {faded:?}", texel(1, 50));
     assert_eq!(store.index().layers[1].levels[0].entries[1], TileEntry::EMPTY);
 }
 

@@ -19,7 +19,7 @@ pub fn cell(scene: &Scene, quality: Quality) -> Cell {
         Ok(answer) => answer,
         Err(kernel::Refusal(why)) => return Cell::refused(scene.name, method, why),
     };
-    let odd = answer.distance_m.iter().filter(|d| d.is_nan() || **d < 0.0).count();
+    let odd = answer.inverse_depth.iter().filter(|inverse| inverse.is_nan() || **inverse < 0.0).count();
     if odd > 0 {
         return Cell::measured(scene.name, method, odd as f64, 0.0, "pixels not a distance");
     }
@@ -65,7 +65,7 @@ fn below(scene: &Scene, view: &View, color: [u8; 3]) -> Cell {
 /// are confused. Pixels that see the rim of the land are left out.
 fn plane_errors(view: &View, answer: &Depths, plane: Plane) -> Vec<f64> {
     let camera = &view.camera;
-    let mut errors = Vec::with_capacity(answer.distance_m.len());
+    let mut errors = Vec::with_capacity(answer.inverse_depth.len());
     for y in 0..camera.height {
         for x in 0..camera.width {
             let ray = camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5).normalize();
@@ -73,11 +73,11 @@ fn plane_errors(view: &View, answer: &Depths, plane: Plane) -> Vec<f64> {
             let sinks = plane.slope[0] * ray.x + plane.slope[1] * ray.y - ray.z;
             let distance = if sinks > 0.0 { above / sinks } else { f64::INFINITY };
             let at = camera.position + ray * distance;
-            let claimed = answer.distance_m[(y * camera.width + x) as usize];
+            let claimed = answer.distance_m(view, x, y);
             if !distance.is_finite() || !plane.holds_well(at.x, at.y) {
                 continue;
             }
-            let off_m = (f64::from(claimed) - distance).abs() * sinks;
+            let off_m = (claimed - distance).abs() * sinks;
             errors.push(off_m * camera.focal_px() / distance);
         }
     }
@@ -88,7 +88,7 @@ fn plane_errors(view: &View, answer: &Depths, plane: Plane) -> Vec<f64> {
 /// if the edge runs through the pixel.
 fn edge_error(view: &View, answer: &Depths, row_px: f64) -> f64 {
     let (width, height) = (view.camera.width, view.camera.height);
-    let seen = |row: u32| answer.distance_m[(row * width + width / 2) as usize].is_finite();
+    let seen = |row: u32| answer.distance_m(view, width / 2, row).is_finite();
     let first = (0..height).find(|&row| seen(row)).unwrap_or(height);
     // Centres below the edge see ground: it lies within half a pixel of this row's top.
     ((f64::from(first) - row_px).abs() - 0.5).max(0.0)

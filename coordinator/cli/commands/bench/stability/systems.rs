@@ -8,7 +8,7 @@ use terrafarm_common::flight::{Flight, Keyframe};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_raycast::{View, depths};
+use terrafarm_raycast::{Unseen, View, depths};
 use terrafarm_terrain::hillshade::hillshade;
 use terrafarm_terrain::layout::PostWindow;
 use terrafarm_terrain::resident::Resident;
@@ -103,12 +103,15 @@ fn missing_tiles() -> anyhow::Result<Vec<Cell>> {
         let quality = Quality { method, ..Quality::default() };
         let view = View { camera, shading: shading.clone(), quality };
         match depths(&empty, &land.pyramid, &view, Region::whole(size.0, size.1)) {
-            Err(missing) => {
-                let why = format!("it names {} tiles that it misses", missing.0.len());
+            Err(Unseen::Missing(tiles)) => {
+                let why = format!("it names {} tiles that it misses", tiles.len());
                 Cell::refused("no tile in memory", method.name(), why)
             }
+            Err(Unseen::Unfit(unfit)) => {
+                Cell::refused("no tile in memory", method.name(), unfit.to_string())
+            }
             Ok(seen) => {
-                let pixels = seen.distance_m.len() as f64;
+                let pixels = seen.inverse_depth.len() as f64;
                 Cell::measured("no tile in memory", method.name(), pixels, 0.0, "pixels made up")
             }
         }

@@ -1,0 +1,281 @@
+//! Beams abreast: the quarters of a square, their quarters and theirs, a beam a lane.
+//!
+//! Does what `Beams::advance` does, over a single height layer. Bounds need not be the
+//! same to the bit: a beam is loose on the safe side by far more.
+
+use super::{
+    CLEARANCE_M, FLAT_REACH_M, NARROWEST_PX, REACH_RAD, ROUNDING, SHORTEST_STEP, WIDEST_PX,
+};
+use crate::exact::{Globe, Tiles};
+use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
+use terrafarm_common::camera::Camera;
+use terrafarm_common::region::Region;
+use terrafarm_terrain::tile::MAXIMA_LEVELS;
+
+/// The most squares at once, and elements of their arrays.
+const MOST_SQUARES: usize = ((WIDEST_PX / NARROWEST_PX) * (WIDEST_PX / NARROWEST_PX)) as usize;
+const ROOM: usize = MOST_SQUARES + MOST;
+
+/// The only height layer of a store, as beams of one camera come over it.
+pub(super) struct Layer<'a> {
+    pub(super) camera: &'a Camera,
+    /// `None` for flat ground.
+    pub(super) globe: Option<Globe>,
+    /// Position of the camera, in cells from post (0, 0).
+    pub(super) eye: [f64; 2],
+    /// Cells per metre.
+    pub(super) scale: [f64; 2],
+    pub(super) cells: [i32; 2],
+    /// Highest height of the terrain, metres.
+    pub(super) highest: f64,
+    /// Shortest side of a cell, metres.
+    pub(super) finest_step: f64,
+    /// Room to be kept above the ground, metres for each metre away.
+    pub(super) slack: f64,
+    pub(super) tiles: Tiles<'a>,
+}
+
+/// Squares of one side, in the order of their parents.
+pub(super) struct Squares {
+    pub(super) count: usize,
+    /// Column and row of the first pixel.
+    pub(super) left: [f64; ROOM],
+    pub(super) top: [f64; ROOM],
+    /// Depth up to which the beam is free, and its step.
+    pub(super) free: [f64; ROOM],
+    pub(super) step: [f64; ROOM],
+}
+
+/// Narrows a square of pixels down to the narrowest. Returns the steps taken.
+pub(super) struct Narrow<'n, 'a> {
+    pub(super) layer: &'n mut Layer<'a>,
+    pub(super) region: Region,
+    /// The square, and afterwards the narrowest ones in it.
+    pub(super) squares: &'n mut Squares,
+}
+
+/// Bounds of the directions in squares; see `Bounds` of the slow twin.
+struct Bounds<L: Lanes> {
+    low: [L::D; 3],
+    high: [L::D; 3],
+    across_squared: L::D,
+    reach: L::D,
+    /// Length of the longest ray at depth 1.
+    longest: L::D,
+}
+
+impl Squares {
+    pub(super) fn new() -> Self {
+        Squares {
+            count: 0,
+            left: [0.0; ROOM],
+            top: [0.0; ROOM],
+            free: [0.0; ROOM],
+            step: [0.0; ROOM],
+        }
+    }
+
+    /// Starts over with one square.
+    pub(super) fn set(&mut self, left: u32, top: u32, free: f64, step: f64) {
+        self.count = 0;
+        self.push([f64::from(left), f64::from(top), free, step]);
+    }
+
+    fn push(&mut self, [left, top, free, step]: [f64; 4]) {
+        let at = self.count;
+        (self.left[at], self.top[at], self.free[at], self.step[at]) = (left, top, free, step);
+        self.count = at + 1;
+    }
+
+    /// Quarters all squares; what is outside a region is dropped.
+    fn quarter(&mut self, half: f64, region: Region) {
+        let (right, bottom) = (
+            f64::from(region.x) + f64::from(region.width),
+            f64::from(region.y) + f64::from(region.height),
+        );
+        let mut quarters = Squares::new();
+        for at in 0..self.count {
+            for (across, down) in [(0.0, 0.0), (half, 0.0), (0.0, half), (half, half)] {
+                let (left, top) = (self.left[at] + across, self.top[at] + down);
+                if left < right && top < bottom {
+                    quarters.push([left, top, self.free[at], self.step[at]]);
+                }
+            }
+        }
+        *self = quarters;
+    }
+}
+
+impl Kernel for Narrow<'_, '_> {
+    type Output = u64;
+
+    #[inline(always)]
+    fn run<L: Lanes>(self) -> u64 {
+        let Narrow { layer, region, squares } = self;
+        let mut steps = 0;
+        let mut side = WIDEST_PX;
+        while side > NARROWEST_PX {
+            side /= 2;
+            squares.quarter(f64::from(side), region);
+            let mut at = 0;
+            while at < squares.count {
+                let left = squares.count - at;
+                let lanes =
+                    if left < L::N { L::M::from_bits((1 << left) - 1) } else { !L::M::none() };
+                steps += match layer.globe {
+                    None => layer.advance::<L, false>(squares, region, at, f64::from(side), lanes),
+                    Some(_) => {
+                        layer.advance::<L, true>(squares, region, at, f64::from(side), lanes)
+                    }
+                };
+                at += L::N;
+            }
+        }
+        steps
+    }
+}
+
+impl Layer<'_> {
+    #[inline(always)]
+    fn bounds<L: Lanes>(
+        &self,
+        squares: &Squares,
+        region: Region,
+        at: usize,
+        side: f64,
+    ) -> Bounds<L> {
+        let camera = self.camera;
+        let right = f64::from(region.x) + f64::from(region.width);
+        let bottom = f64::from(region.y) + f64::from(region.height);
+        let (left, top) = (L::D::load(&squares.left[at..]), L::D::load(&squares.top[at..]));
+        let right = (left + L::D::splat(side)).min(L::D::splat(right));
+        let bottom = (top + L::D::splat(side)).min(L::D::splat(bottom));
+        let scale = L::D::splat(2.0 * camera.tan_half_hfov / f64::from(camera.width));
+        let middle_x = L::D::splat(0.5 * f64::from(camera.width));
+        let middle_y = L::D::splat(0.5 * f64::from(camera.height));
+        let across = [(left - middle_x) * scale, (right - middle_x) * scale];
+        let upward = [(middle_y - top) * scale, (middle_y - bottom) * scale];
+        let zero = L::D::splat(0.0);
+        let mut longest = zero;
+        let mut low = [L::D::splat(f64::INFINITY); 3];
+        let mut high = [L::D::splat(f64::NEG_INFINITY); 3];
+        for corner in 0..4 {
+            let mut square = zero;
+            for axis in 0..3 {
+                let part = L::D::splat(camera.forward[axis])
+                    + L::D::splat(camera.right[axis]) * across[corner & 1]
+                    + L::D::splat(camera.up[axis]) * upward[corner >> 1];
+                square = square + part * part;
+                low[axis] = part.min(low[axis]);
+                high[axis] = part.max(high[axis]);
+            }
+            longest = longest.max(square);
+        }
+        let margin = longest * L::D::splat(ROUNDING);
+        for axis in 0..3 {
+            low[axis] = low[axis] - margin;
+            high[axis] = high[axis] + margin;
+        }
+        let x = low[0].max(zero - high[0]).max(zero);
+        let y = low[1].max(zero - high[1]).max(zero);
+        let reach = match &self.globe {
+            Some(globe) => REACH_RAD / globe.curvature,
+            None => FLAT_REACH_M,
+        };
+        let longest = longest.sqrt();
+        let reach = L::D::splat(reach).div(longest);
+        Bounds { low, high, across_squared: x * x + y * y, reach, longest }
+    }
+
+    /// Goes on with N beams as far as they are free.
+    #[inline(always)]
+    fn advance<L: Lanes, const ROUND: bool>(
+        &mut self,
+        squares: &mut Squares,
+        region: Region,
+        at: usize,
+        side: f64,
+        lanes: L::M,
+    ) -> u64 {
+        let bounds = self.bounds::<L>(squares, region, at, side);
+        let (half, two) = (L::D::splat(0.5), L::D::splat(2.0));
+        let eye_z = L::D::splat(self.camera.position.z);
+        let width = L::D::splat(side / self.camera.focal_px() * SHORTEST_STEP);
+        let level_or_up = L::D::splat(0.0).le(bounds.low[2]);
+        let mut free = L::D::load(&squares.free[at..]);
+        let mut step = L::D::load(&squares.step[at..]);
+        let mut active = lanes & free.lt(bounds.reach);
+        let mut steps = 0;
+        while active.any() {
+            steps += u64::from(active.count());
+            let end = (free + step).min(bounds.reach);
+            let mut rise = (bounds.low[2] * free).min(bounds.low[2] * end);
+            if let (true, Some(globe)) = (ROUND, &self.globe) {
+                rise = globe.rise::<L>(bounds.across_squared * free * free, rise);
+            }
+            let room = L::D::splat(self.slack) * end * bounds.longest;
+            let lowest = eye_z + rise - L::D::splat(CLEARANCE_M) - room;
+            let away = active & level_or_up & L::D::splat(self.highest).lt(lowest);
+            free = L::D::select(away, L::D::splat(f64::INFINITY), free);
+            active = active & !away;
+            let clear = active & self.is_clear::<L>(&bounds, free, end, lowest, active);
+            free = L::D::select(clear, end, free);
+            let long = (width * end + L::D::splat(self.finest_step)).lt(step);
+            let shorter = active & !clear & long;
+            step = L::D::select(clear, two * step, step);
+            step = L::D::select(shorter, half * step, step);
+            active = ((active & clear) | shorter) & free.lt(bounds.reach);
+        }
+        free.store(&mut squares.free[at..]);
+        step.store(&mut squares.step[at..]);
+        steps
+    }
+
+    /// Whether all ground below beams from one depth to another is lower than `lowest`,
+    /// by four blocks that cover it.
+    #[inline(always)]
+    fn is_clear<L: Lanes>(
+        &mut self,
+        bounds: &Bounds<L>,
+        start: L::D,
+        end: L::D,
+        lowest: L::D,
+        lanes: L::M,
+    ) -> L::M {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let mut outside = L::M::none();
+        let (mut first, mut last) = ([zero; 2], [zero; 2]);
+        for axis in 0..2 {
+            let (slow, fast) = (bounds.low[axis], bounds.high[axis]);
+            let (eye, scale) = (L::D::splat(self.eye[axis]), L::D::splat(self.scale[axis]));
+            let low = eye + scale * (slow * start).min(slow * end);
+            let high = eye + scale * (fast * start).max(fast * end);
+            let count = f64::from(self.cells[axis]);
+            let size = low.abs().max(high.abs()) + L::D::splat(1.0 + count);
+            let margin = L::D::splat(ROUNDING) * size;
+            let (low, high) = (low - margin, high + margin);
+            outside = outside | high.lt(L::D::splat(0.0)) | L::D::splat(count).lt(low);
+            // Within the layer, so that they are whole numbers of 32 bits.
+            let end = L::D::splat(count - 1.0);
+            first[axis] = low.max(L::D::splat(0.0)).min(end).truncate();
+            last[axis] = high.max(L::D::splat(0.0)).min(end).truncate();
+        }
+        let inside = lanes & !outside;
+        let side = (last[0] - first[0]).max(last[1] - first[1]);
+        let mut level = one;
+        for bits in 1..MAXIMA_LEVELS {
+            let longer = L::I::splat(1 << bits).lt(side);
+            level = L::I::select(longer, level + one, level);
+        }
+        let mut clear = inside & !L::I::splat(1 << MAXIMA_LEVELS).lt(side);
+        for corner in
+            [[first[0], first[1]], [last[0], last[1]], [last[0], first[1]], [first[0], last[1]]]
+        {
+            if clear.any() {
+                let (highest, _) = self.tiles.maxima::<L>(corner, level, clear);
+                clear = clear & highest.lt(lowest);
+            }
+        }
+        (lanes & outside) | clear
+    }
+}

@@ -1,0 +1,86 @@
+//! A list of rays, and what they meet: one array for each number.
+
+use crate::lanes::MOST;
+
+/// The most rays of a list.
+pub(crate) const MOST_RAYS: usize = 1024;
+/// Elements of an array: vectors may reach beyond the last ray, and begin anywhere.
+const ROOM: usize = MOST_RAYS + 2 * MOST;
+
+/// What is kept of each ray as f64.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Part {
+    /// Place in the picture, pixels ...
+    PlaceX,
+    PlaceY,
+    /// ... and the depth up to which the ray is known to be free.
+    Depth,
+    DirectionX,
+    DirectionY,
+    DirectionZ,
+    /// Parameter at which the walk begins, and then that of the contact.
+    U,
+    /// Height there.
+    Z,
+    RateX,
+    RateY,
+    InverseX,
+    InverseY,
+    /// Where the stretch or the span begins, whichever is last ...
+    First,
+    /// ... and where one of them ends; -infinity if there is nothing to walk over.
+    Last,
+    /// Where the stretch ends.
+    End,
+    /// Over a round Earth: the span in which the walk begins.
+    Across,
+    Number,
+    StartU,
+    EndU,
+    StartZ,
+    EndZ,
+    Slope,
+    Bend,
+    /// One over the depth of the contact, per metre.
+    InverseDepth,
+}
+
+const PARTS: usize = Part::InverseDepth as usize + 1;
+
+/// What became of a ray.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Verdict {
+    Hit,
+    Miss,
+    /// It is for the slow twin to say.
+    Open,
+}
+
+/// Rays of one view over one layer.
+pub(super) struct Rays {
+    parts: Vec<[f64; ROOM]>,
+    pub(super) cells: [Vec<i32>; 2],
+    pub(super) verdicts: Vec<Verdict>,
+    pub(super) count: usize,
+}
+
+impl Rays {
+    pub(super) fn new() -> Self {
+        Rays {
+            parts: vec![[0.0; ROOM]; PARTS],
+            cells: [vec![0; ROOM], vec![0; ROOM]],
+            verdicts: vec![Verdict::Miss; ROOM],
+            count: 0,
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn part(&self, part: Part) -> &[f64; ROOM] {
+        &self.parts[part as usize]
+    }
+
+    #[inline(always)]
+    pub(super) fn part_mut(&mut self, part: Part) -> &mut [f64; ROOM] {
+        &mut self.parts[part as usize]
+    }
+}

@@ -1,0 +1,213 @@
+//! The tiles of a layer as kernels read them, by number.
+
+use crate::field::{Field, Ground, tile_key};
+use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
+use crate::lanes::as_bits;
+use crate::walk::{maximum, post};
+use terrafarm_terrain::layout::TILE_POSTS;
+use terrafarm_terrain::tile::{Codes, Heights, MAXIMA_LEVELS, VOID};
+
+/// Tiles that are remembered: a few rows of a region come over no more.
+const SLOTS: usize = 64;
+/// The number of no tile.
+const NONE: i32 = -1;
+
+/// Looks tiles of level 0 of one layer up and remembers them.
+pub(crate) struct Tiles<'a> {
+    field: Field<'a>,
+    layer: usize,
+    /// Tiles along x.
+    columns: i32,
+    slots: Vec<(i32, Soil<'a>)>,
+    /// The tile that was read last.
+    last: (i32, Soil<'a>),
+}
+
+/// What a tile holds.
+#[derive(Clone, Copy)]
+enum Soil<'a> {
+    Codes(Codes<'a>),
+    /// Heights as they are, as bits.
+    Floats {
+        posts: &'a [u32],
+        maxima: &'a [u32],
+    },
+    /// No surface at all.
+    Void,
+    /// It is not loaded; the index knows its maximum.
+    Absent {
+        highest: f32,
+    },
+}
+
+/// The corners of cells.
+pub(super) struct Corners<L: Lanes> {
+    /// South-west, south-east, north-west, north-east, metres.
+    pub heights: [L::D; 4],
+    /// The cells that have a surface.
+    pub solid: L::M,
+    /// The cells whose tile is not loaded.
+    pub absent: L::M,
+}
+
+impl<'a> Tiles<'a> {
+    pub(crate) fn new(field: Field<'a>, layer: usize) -> Self {
+        let levels = &field.index().layers[layer].levels;
+        let columns = levels.first().map_or(0, |level| level.tiles[0] as i32);
+        let none = (NONE, Soil::Void);
+        Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none }
+    }
+
+    /// Makes `last` the tile with a number.
+    #[inline(always)]
+    fn turn_to(&mut self, number: i32) {
+        let slot = self.slots[number as usize % SLOTS];
+        if slot.0 == number { self.last = slot } else { self.fetch(number) }
+    }
+
+    #[cold]
+    fn fetch(&mut self, number: i32) {
+        let columns = self.columns.max(1);
+        let cell = [number % columns, number / columns].map(|tile| tile << MAXIMA_LEVELS);
+        let key = tile_key(self.layer, cell);
+        self.field.resident.touch(key);
+        let soil = match self.field.ground(key) {
+            Ground::Loaded(tile) => match tile.heights() {
+                Heights::Codes(codes) => Soil::Codes(codes),
+                Heights::Floats(floats) => {
+                    let (posts, maxima) = (as_bits(floats.posts), as_bits(floats.maxima));
+                    Soil::Floats { posts, maxima }
+                }
+            },
+            Ground::Void => Soil::Void,
+            Ground::Absent => {
+                let entry = self.field.index().entry(key);
+                Soil::Absent { highest: entry.map_or(f32::INFINITY, |entry| entry.max) }
+            }
+        };
+        self.last = (number, soil);
+        self.slots[number as usize % SLOTS] = self.last;
+    }
+
+    #[inline(always)]
+    fn numbers<L: Lanes>(&self, cell: [L::I; 2]) -> L::I {
+        let levels = L::I::splat(MAXIMA_LEVELS as i32);
+        cell[1].shr(levels).times(L::I::splat(self.columns)) + cell[0].shr(levels)
+    }
+
+    /// Those of `lanes` that are over one tile, which becomes `last`.
+    #[inline(always)]
+    fn alike<L: Lanes>(&mut self, numbers: L::I, lanes: L::M) -> L::M {
+        let here = lanes & numbers.eq(L::I::splat(self.last.0));
+        if here.any() {
+            return here;
+        }
+        let mut values = [0; crate::lanes::MOST];
+        numbers.store(&mut values);
+        let first = lanes.bits().trailing_zeros() as usize % crate::lanes::MOST;
+        self.turn_to(values[first]);
+        lanes & numbers.eq(L::I::splat(self.last.0))
+    }
+
+    /// Maxima over blocks of `1 << level` cells, metres, for `lanes`: -infinity where no
+    /// cell has a surface, that of the whole tile where it is not loaded. Also these lanes.
+    #[inline(always)]
+    pub(crate) fn maxima<L: Lanes>(
+        &mut self,
+        cell: [L::I; 2],
+        level: L::I,
+        lanes: L::M,
+    ) -> (L::D, L::M) {
+        let at = maximum::<L>([cell[0].shr(level), cell[1].shr(level)], level);
+        let numbers = self.numbers::<L>(cell);
+        let mut highest = L::D::splat(f64::NEG_INFINITY);
+        let mut absent = L::M::none();
+        let mut rest = lanes;
+        while rest.any() {
+            let here = self.alike::<L>(numbers, rest);
+            match self.last.1 {
+                Soil::Codes(codes) => {
+                    let code = L::I::gather_pairs(codes.maxima, at, here) & L::I::splat(0xFFFF);
+                    let any = here & !code.eq(L::I::splat(0));
+                    highest = L::D::select(any, heights::<L>(&codes, code), highest);
+                }
+                Soil::Floats { maxima, .. } => {
+                    highest = L::D::select(here, read_float::<L>(maxima, at, here), highest);
+                }
+                Soil::Void => {}
+                Soil::Absent { highest: all } => {
+                    highest = L::D::select(here, L::D::splat(f64::from(all)), highest);
+                    absent = absent | here;
+                }
+            }
+            rest = rest & !here;
+        }
+        (highest, absent)
+    }
+
+    /// The corners of cells, for `lanes`.
+    #[inline(always)]
+    pub(super) fn corners<L: Lanes>(&mut self, cell: [L::I; 2], lanes: L::M) -> Corners<L> {
+        let at = post::<L>(cell);
+        let north = at + L::I::splat(TILE_POSTS as i32);
+        let numbers = self.numbers::<L>(cell);
+        let none = L::D::splat(0.0);
+        let mut corners = Corners { heights: [none; 4], solid: L::M::none(), absent: L::M::none() };
+        let mut rest = lanes;
+        while rest.any() {
+            let here = self.alike::<L>(numbers, rest);
+            match self.last.1 {
+                Soil::Codes(codes) => {
+                    let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
+                    let south = L::I::gather_pairs(codes.posts, at, here);
+                    let north = L::I::gather_pairs(codes.posts, north, here);
+                    let read = [
+                        south & low,
+                        south.shr(sixteen) & low,
+                        north & low,
+                        north.shr(sixteen) & low,
+                    ];
+                    let highest = read[0].max(read[1]).max(read[2].max(read[3]));
+                    let solid = highest.lt(L::I::splat(i32::from(VOID)));
+                    corners.solid = corners.solid | (here & solid);
+                    for n in 0..4 {
+                        let height = heights::<L>(&codes, read[n]);
+                        corners.heights[n] = L::D::select(here, height, corners.heights[n]);
+                    }
+                }
+                Soil::Floats { posts, .. } => {
+                    let one = L::I::splat(1);
+                    let read = [
+                        read_float::<L>(posts, at, here),
+                        read_float::<L>(posts, at + one, here),
+                        read_float::<L>(posts, north, here),
+                        read_float::<L>(posts, north + one, here),
+                    ];
+                    // A void is NaN, and so is the sum.
+                    let sum = read[0] + read[1] + read[2] + read[3];
+                    let solid = sum.abs().lt(L::D::splat(f64::INFINITY));
+                    corners.solid = corners.solid | (here & solid);
+                    for n in 0..4 {
+                        corners.heights[n] = L::D::select(here, read[n], corners.heights[n]);
+                    }
+                }
+                Soil::Void => {}
+                Soil::Absent { .. } => corners.absent = corners.absent | here,
+            }
+            rest = rest & !here;
+        }
+        corners
+    }
+}
+
+/// Heights of codes, metres: what the tile gives back for each, to the bit.
+#[inline(always)]
+fn heights<L: Lanes>(codes: &Codes, code: L::I) -> L::D {
+    let steps = L::D::from_ints(L::I::splat(codes.base) + code);
+    (steps * L::D::splat(codes.step)).to_single()
+}
+
+#[inline(always)]
+fn read_float<L: Lanes>(table: &[u32], at: L::I, lanes: L::M) -> L::D {
+    L::D::from_floats(L::F::from_bits(L::I::gather(table, at, lanes)))
+}

@@ -1,0 +1,126 @@
+//! The methods that trade accuracy for speed: which one a view gets, and what it sees.
+
+use crate::View;
+use crate::column::{self, Columns};
+use crate::field::Field;
+use crate::lanes;
+use crate::lod::Lod;
+use crate::relief::Relief;
+use crate::seen::{Seen, Unfit};
+use terrafarm_common::camera::Camera;
+use terrafarm_common::quality::{self, Quality};
+use terrafarm_common::region::Region;
+use terrafarm_terrain::layout::{LayerKind, StoreIndex, TileKey};
+
+/// The least tolerance for which lines a few pixels apart are worth their while; below it
+/// every pixel has a ray of its own. Measured with `bench speed-accuracy`.
+const LEAST_FOR_COLUMN_PX: f64 = 0.1;
+/// The least tolerance that level of detail in single precision keeps.
+const LEAST_FOR_LOD_PX: f64 = 0.02;
+/// The least part of a ray along the map, as a share of its length, that counts.
+const STEEPEST: f64 = 1e-6;
+
+/// How a view is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Look {
+    /// By `exact` or `reference`.
+    RayByRay(quality::Method),
+    Fast(Method),
+}
+
+/// One of the fast methods.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Method {
+    Lod,
+    Column,
+}
+
+impl Look {
+    /// What a view asks for; `auto` takes the cheapest that its tolerance allows.
+    pub(crate) fn of(field: Field, view: &View) -> Result<Look, Unfit> {
+        let Quality { method, tolerance_px, .. } = view.quality;
+        let why = unfit(field.index());
+        let fast = |fast: Method| match why {
+            None => Ok(Look::Fast(fast)),
+            Some(why) => Err(Unfit { method, why: why.into(), instead: quality::Method::Exact }),
+        };
+        match method {
+            quality::Method::Lod => fast(Method::Lod),
+            quality::Method::Column => fast(Method::Column),
+            quality::Method::Auto if why.is_none() && tolerance_px >= LEAST_FOR_COLUMN_PX => {
+                Ok(Look::Fast(Method::Column))
+            }
+            quality::Method::Auto if why.is_none() && tolerance_px >= LEAST_FOR_LOD_PX => {
+                Ok(Look::Fast(Method::Lod))
+            }
+            quality::Method::Auto => Ok(Look::RayByRay(quality::Method::Exact)),
+            other => Ok(Look::RayByRay(other)),
+        }
+    }
+}
+
+/// Why the fast methods cannot look at a store.
+fn unfit(index: &StoreIndex) -> Option<&'static str> {
+    let mut layers = index.layers_of(LayerKind::Height);
+    match (layers.next(), layers.next()) {
+        (None, _) => Some("the store has no heights"),
+        (_, Some(_)) => Some("the store has insets, and it sees one height layer only"),
+        (Some((_, layer)), None) if layer.posts.contains(&1) => {
+            Some("the store has a single row of posts, so there is no ground to see")
+        }
+        _ => None,
+    }
+}
+
+/// Sees a region. Also returns the tiles that were missing, sorted.
+pub(crate) fn see(
+    field: Field,
+    view: &View,
+    region: Region,
+    method: Method,
+) -> Result<(Seen, Vec<TileKey>), Unfit> {
+    let tolerance_px = view.quality.tolerance_px;
+    let share = if method == Method::Column { column::LEVELS } else { 1.0 };
+    let relief = Relief::new(field, view, share * tolerance_px);
+    let (relief, camera) = (&relief, &view.camera);
+    let seen = match method {
+        Method::Lod => {
+            let slack = relief.tolerance;
+            lanes::run(Lod { field, relief, view, region, slack }, lanes::widest())
+        }
+        Method::Column => {
+            lanes::run(Columns { relief, camera, tolerance_px, region }, lanes::widest())
+        }
+    };
+    Ok((seen, relief.wanted()))
+}
+
+/// A view of which each pixel is one of so many samples along the side of a pixel, and
+/// the region of it that covers a region.
+pub(crate) fn supersampled(view: &View, region: Region, samples: u32) -> (View, Region) {
+    let mut fine = view.clone();
+    fine.camera.width *= samples;
+    fine.camera.height *= samples;
+    fine.quality.tolerance_px *= f64::from(samples);
+    let Region { x, y, width, height } = region;
+    let [x, y, width, height] = [x, y, width, height].map(|length| length * samples);
+    (fine, Region { x, y, width, height })
+}
+
+/// Map distances of what the pixels of a row of a region see, metres, from one over their
+/// depths: as [`crate::shade::Places`] has them.
+pub(crate) fn map_distances(
+    camera: &Camera,
+    region: Region,
+    row: u32,
+    inverse_depth: &[f32],
+    s: &mut [f32],
+) {
+    let first = camera.ray(f64::from(region.x) + 0.5, f64::from(region.y + row) + 0.5);
+    let step = camera.ray(f64::from(region.x) + 1.5, f64::from(region.y + row) + 0.5) - first;
+    for (at, (s, &inverse)) in s.iter_mut().zip(inverse_depth).enumerate() {
+        let ray = first + step * at as f64;
+        let across = (ray.x * ray.x + ray.y * ray.y).sqrt().max(STEEPEST * ray.length());
+        *s = across as f32 / inverse;
+    }
+}

@@ -1,0 +1,233 @@
+//! Questions about single points and whole regions, without colours.
+
+use crate::View;
+use crate::beam::Beams;
+use crate::exact::Many;
+use crate::fast::{self, Look};
+use crate::field::{Contact, Field, Outcome};
+use crate::lanes;
+use crate::painter::{Caster, path, squares};
+use crate::path::{Ground, Path};
+use crate::progress::Stats;
+use crate::pyramid::Pyramid;
+use crate::seen::Unfit;
+use glam::DVec3;
+use std::collections::BTreeSet;
+use terrafarm_common::region::Region;
+use terrafarm_terrain::layout::TileKey;
+use terrafarm_terrain::resident::Resident;
+
+/// What a point of the picture shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hit {
+    /// Index of the height layer.
+    pub layer: usize,
+    /// Column of the cell of level 0.
+    pub i: u64,
+    /// Row of the cell of level 0.
+    pub j: u64,
+    /// Place within the cell along x, 0 to 1.
+    pub u: f64,
+    /// Place within the cell along y, 0 to 1.
+    pub v: f64,
+    /// The point of the ray that touches the ground, grid frame.
+    pub position: DVec3,
+    /// Height of the surface there, metres: above `position.z` if the ray ran into a
+    /// wall.
+    pub height: f64,
+    /// Distance from the camera, metres.
+    pub distance_m: f64,
+    /// The same measured over the map and along the ray's start; over flat ground it is
+    /// the distance.
+    pub parameter_m: f64,
+}
+
+/// Tiles that a question depends on but that are not loaded, sorted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Missing(pub Vec<TileKey>);
+
+/// Why a region was not seen.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Unseen {
+    /// These tiles are not loaded, sorted.
+    Missing(Vec<TileKey>),
+    /// The method is not made for the view.
+    Unfit(Unfit),
+}
+
+impl From<Missing> for Unseen {
+    fn from(Missing(tiles): Missing) -> Self {
+        Unseen::Missing(tiles)
+    }
+}
+
+impl From<Unfit> for Unseen {
+    fn from(unfit: Unfit) -> Self {
+        Unseen::Unfit(unfit)
+    }
+}
+
+/// What is seen at a point of the picture, in pixels from the top left corner; `None` for
+/// no ground. A camera at or below the ground hits it at once.
+pub fn cast(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    x_px: f64,
+    y_px: f64,
+) -> Result<Option<Hit>, Missing> {
+    let field = Field { resident, pyramid };
+    let ground = Ground::new(view.shading.earth);
+    let (path, _) = path(&view.camera, ground, [x_px, y_px], 0.0);
+    let mut caster = Caster::new(field, view.quality.method);
+    match caster.cast(&path, 0.0) {
+        Outcome::Hit(contact) => Ok(Some(Hit::new(&path, &contact))),
+        Outcome::Miss => Ok(None),
+        Outcome::Unfinished => {
+            let mut missing = BTreeSet::new();
+            caster.finish(&mut missing);
+            Err(Missing(missing.into_iter().collect()))
+        }
+    }
+}
+
+/// What is seen through the centres of the pixels of a region: `see` is told of each
+/// pixel, by column and row, whether and where its ray meets the ground. The counters
+/// are those of a rendered picture with one sample a pixel.
+///
+/// # Errors
+/// If tiles are missing; `see` is not told of the pixels that need them.
+pub fn trace(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+    mut see: impl FnMut(u32, u32, Option<Hit>),
+) -> Result<Stats, Missing> {
+    sweep(resident, pyramid, view, region, |many, ray, [x, y]| match many.outcome(ray) {
+        Outcome::Hit(contact) => see(x, y, Some(Hit::new(&many.path(ray).0, &contact))),
+        Outcome::Miss => see(x, y, None),
+        Outcome::Unfinished => {}
+    })
+}
+
+/// Casts the rays through the centres of the pixels of a region and shows each.
+fn sweep(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+    mut see: impl FnMut(&mut Many, usize, [u32; 2]),
+) -> Result<Stats, Missing> {
+    let mut stats = Stats::default();
+    let mut missing = BTreeSet::new();
+    let field = Field { resident, pyramid };
+    let ground = Ground::new(view.shading.earth);
+    let method = view.quality.method;
+    let mut many = Many::new(field, &view.camera, ground, method, lanes::widest());
+    let mut beams = Beams::new(field, &view.camera, ground);
+    let mut pixels = Vec::new();
+    for square in squares(region) {
+        pixels.clear();
+        many.clear();
+        beams.narrow(square, &mut |x, y, free| {
+            pixels.push([x, y]);
+            many.push([f64::from(x) + 0.5, f64::from(y) + 0.5], free);
+        });
+        many.cast();
+        stats.rays += many.len() as u64;
+        for (ray, &pixel) in pixels.iter().enumerate() {
+            stats.hits += u64::from(many.is_hit(ray) == Some(true));
+            see(&mut many, ray, pixel);
+        }
+    }
+    stats.steps = beams.steps + many.steps + many.slow.finish(&mut missing);
+    if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
+}
+
+/// How far away is what is seen through the centres of the pixels of a region.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Depths {
+    /// The pixels.
+    pub region: Region,
+    /// One over the depth of each pixel, per metre, rows from the top; 0 for the sky. The
+    /// depth is the distance along the axis of the camera: what is seen is at
+    /// `ray / inverse_depth` from the camera, with the pixel's [`Camera::ray`]. Over a round
+    /// Earth that holds along the map.
+    pub inverse_depth: Vec<f32>,
+    /// What it took.
+    pub stats: Stats,
+}
+
+impl Depths {
+    /// Straight distance from the camera of what a pixel of the region shows, metres;
+    /// infinite for the sky. The view must be the same.
+    pub fn distance_m(&self, view: &View, x: u32, y: u32) -> f64 {
+        let (column, row) = (x - self.region.x, y - self.region.y);
+        let at = row as usize * self.region.width as usize + column as usize;
+        let inverse = f64::from(self.inverse_depth[at]);
+        if inverse == 0.0 {
+            return f64::INFINITY;
+        }
+        let ground = Ground::new(view.shading.earth);
+        let place = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+        let length = view.camera.ray(place[0], place[1]).length();
+        let (path, _) = path(&view.camera, ground, place, 0.0);
+        path.distance_at(length / inverse)
+    }
+}
+
+/// How far away is what is seen through the centres of the pixels of a region.
+///
+/// # Errors
+/// If tiles are missing, or the method is not made for the view.
+pub fn depths(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+) -> Result<Depths, Unseen> {
+    let field = Field { resident, pyramid };
+    if let Look::Fast(method) = Look::of(field, view)? {
+        if let Err(tile) = field.is_below(view.camera.position) {
+            return Err(Unseen::Missing(vec![tile]));
+        }
+        let (seen, wanted) = fast::see(field, view, region, method)?;
+        if !wanted.is_empty() {
+            return Err(Unseen::Missing(wanted));
+        }
+        let stats = Stats {
+            rays: seen.rays,
+            steps: seen.steps,
+            fallbacks: seen.alone,
+            ..Stats::default()
+        };
+        return Ok(Depths { region, inverse_depth: seen.inverse_depth, stats });
+    }
+    let mut inverse_depth = vec![0.0; region.area() as usize];
+    let stats = sweep(resident, pyramid, view, region, |many, ray, [x, y]| {
+        let at = (y - region.y) as usize * region.width as usize + (x - region.x) as usize;
+        if let Some(inverse) = many.inverse_depth(ray) {
+            inverse_depth[at] = inverse;
+        }
+    })?;
+    Ok(Depths { region, inverse_depth, stats })
+}
+
+impl Hit {
+    fn new(path: &Path, contact: &Contact) -> Self {
+        let along = path.direction * contact.u;
+        let [u, v] = contact.place;
+        Hit {
+            layer: contact.layer,
+            i: contact.cell[0] as u64,
+            j: contact.cell[1] as u64,
+            u,
+            v,
+            position: DVec3::new(path.origin.x + along.x, path.origin.y + along.y, contact.z),
+            height: contact.corners.height(u, v),
+            distance_m: path.distance(contact.u, contact.z),
+            parameter_m: contact.u,
+        }
+    }
+}
