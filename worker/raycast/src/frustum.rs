@@ -28,8 +28,8 @@ use crate::View;
 use crate::beam::{Beams, Front};
 use crate::exact::Exact;
 use crate::field::{Field, Outcome};
+use crate::painter::{path, squares};
 use crate::path::Ground;
-use crate::progress::{path, squares};
 use crate::seen::{Seen, Unfit};
 use std::collections::{BTreeSet, VecDeque};
 use terrafarm_common::camera::Camera;
@@ -53,16 +53,16 @@ pub(crate) fn see(
     view: &View,
     region: Region,
 ) -> Result<(Seen, Vec<TileKey>), Unfit> {
-    let mut sight = Sight::new(field, view);
-    let mut frusta = Frusta::new(&sight, region);
-    while frusta.step(&mut sight) {}
+    let mut caster = Caster::new(field, view);
+    let mut frusta = Frusta::new(&caster, region);
+    while frusta.step(&mut caster) {}
     let mut missing = BTreeSet::new();
-    sight.exact.wanted.drain_into(&mut missing);
+    caster.exact.wanted.drain_into(&mut missing);
     Ok((frusta.seen, missing.into_iter().collect()))
 }
 
 /// What frusta are cast with: the tiles at hand and the camera.
-pub(crate) struct Sight<'a> {
+pub(crate) struct Caster<'a> {
     camera: &'a Camera,
     ground: Ground,
     beams: Beams<'a>,
@@ -95,12 +95,12 @@ struct Frustum {
     front: Front,
 }
 
-impl<'a> Sight<'a> {
+impl<'a> Caster<'a> {
     pub(crate) fn new(field: Field<'a>, view: &'a View) -> Self {
         let camera = &view.camera;
         let ground = Ground::new(view.shading.earth);
         let beams = Beams::new(field, camera, ground);
-        Sight { camera, ground, beams, exact: Exact::new(field) }
+        Caster { camera, ground, beams, exact: Exact::new(field) }
     }
 
     /// One over the depth of what a pixel sees, by a ray that is free up to a depth.
@@ -123,8 +123,8 @@ impl<'a> Sight<'a> {
 
 impl Frusta {
     /// A region of which nothing is known.
-    pub(crate) fn new(sight: &Sight, region: Region) -> Self {
-        let front = sight.beams.start();
+    pub(crate) fn new(caster: &Caster, region: Region) -> Self {
+        let front = caster.beams.start();
         let roots = squares(region).map(|square| Frustum {
             x: square.x,
             y: square.y,
@@ -145,28 +145,28 @@ impl Frusta {
     }
 
     /// Looks at one frustum; `false` if none is left. The view must be the same each time.
-    pub(crate) fn step(&mut self, sight: &mut Sight) -> bool {
+    pub(crate) fn step(&mut self, caster: &mut Caster) -> bool {
         let Some(mut frustum) = self.next() else { return false };
-        let before = sight.steps();
-        frustum.front = sight.beams.follow(frustum.square(), frustum.front);
+        let before = caster.steps();
+        frustum.front = caster.beams.follow(frustum.square(), frustum.front);
         if frustum.front.free == f64::INFINITY {
             for [x, y] in frustum.square().pixels() {
                 self.confirm(x, y, 0.0);
             }
         } else if u32::from(frustum.width.max(frustum.height)) <= NARROWEST_PX {
             for [x, y] in frustum.square().pixels().skip(usize::from(frustum.begun)) {
-                self.cast(sight, x, y, frustum.front.free);
+                self.cast(caster, x, y, frustum.front.free);
             }
         } else {
             if !frustum.begun {
-                self.cast(sight, frustum.x, frustum.y, frustum.front.free);
+                self.cast(caster, frustum.x, frustum.y, frustum.front.free);
                 frustum.begun = true;
             }
             for (quarter, part) in frustum.quarters() {
                 self.quarters[quarter].push(part);
             }
         }
-        self.seen.steps += sight.steps() - before;
+        self.seen.steps += caster.steps() - before;
         true
     }
 
@@ -179,9 +179,9 @@ impl Frusta {
         self.queue.pop_front()
     }
 
-    fn cast(&mut self, sight: &mut Sight, x: u32, y: u32, free: f64) {
+    fn cast(&mut self, caster: &mut Caster, x: u32, y: u32, free: f64) {
         self.seen.rays += 1;
-        let inverse_depth = sight.cast(x, y, free);
+        let inverse_depth = caster.cast(x, y, free);
         self.confirm(x, y, inverse_depth);
     }
 

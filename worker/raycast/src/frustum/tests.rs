@@ -102,13 +102,13 @@ fn it_may_be_interrupted_after_any_frustum_and_resumed_with_new_tools() {
         let view = view(land, &mut dice);
         let whole = Region::whole(SIZE.0, SIZE.1);
         let (expected, _) = see(field(land), &view, whole).expect("it takes any view");
-        let mut frusta = Frusta::new(&Sight::new(field(land), &view), whole);
+        let mut frusta = Frusta::new(&Caster::new(field(land), &view), whole);
         let (mut more, mut before) = (true, 0);
         while more {
             frusta = frusta.clone();
-            let mut sight = Sight::new(field(land), &view);
+            let mut caster = Caster::new(field(land), &view);
             for _ in 0..1 + dice.below(400) {
-                more = frusta.step(&mut sight);
+                more = frusta.step(&mut caster);
             }
             let known = frusta.seen.inverse_depth.iter().zip(&expected.inverse_depth);
             let known = known.filter(|(inverse, _)| !inverse.is_nan());
@@ -135,13 +135,13 @@ fn every_pixel_soon_has_a_confirmed_one_near_it() {
         shading: bare(None),
         quality: Quality::default(),
     };
-    let mut sight = Sight::new(field(&land), &view);
-    let mut frusta = Frusta::new(&sight, Region::whole(size.0, size.1));
+    let mut caster = Caster::new(field(&land), &view);
+    let mut frusta = Frusta::new(&caster, Region::whole(size.0, size.1));
     let mut side = 32;
     while side > NARROWEST_PX {
         // All frusta of a size: at most as many as fit.
         for _ in 0..(size.0 / side) * (size.1 / side) {
-            frusta.step(&mut sight);
+            frusta.step(&mut caster);
         }
         for y in (0..size.1).step_by(side as usize) {
             for x in (0..size.0).step_by(side as usize) {
@@ -155,7 +155,7 @@ fn every_pixel_soon_has_a_confirmed_one_near_it() {
     let mut counts = [0u64; 4];
     let before: Vec<bool> = frusta.seen.inverse_depth.iter().map(|i| i.is_nan()).collect();
     for _ in 0..(size.0 / side) * (size.1 / side) / 4 {
-        frusta.step(&mut sight);
+        frusta.step(&mut caster);
     }
     for (at, &unknown) in before.iter().enumerate() {
         let (x, y) = (at as u32 % size.0, at as u32 / size.0);
