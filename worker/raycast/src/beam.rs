@@ -82,9 +82,9 @@ struct Grid {
 }
 
 /// A beam that is free up to a depth.
-#[derive(Clone, Copy)]
-struct Front {
-    free: f64,
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Front {
+    pub free: f64,
     step: f64,
 }
 
@@ -232,6 +232,17 @@ impl<'a> Beams<'a> {
             longest,
             width: f64::from(square.width.max(square.height)) / camera.focal_px(),
         }
+    }
+
+    /// Where every beam begins.
+    pub(crate) fn start(&self) -> Front {
+        Front { free: 0.0, step: self.first_step }
+    }
+
+    /// Goes on with the beam of a square of pixels, from where one that holds the square
+    /// is known to be free. `free` is infinite if no ray of it meets the ground.
+    pub(crate) fn follow(&mut self, square: Region, front: Front) -> Front {
+        self.advance(&self.bounds(square), front)
     }
 
     fn advance(&mut self, bounds: &Bounds, mut front: Front) -> Front {

@@ -31,6 +31,7 @@ mod column;
 mod exact;
 mod fast;
 mod field;
+mod frustum;
 mod grid;
 mod lanes;
 mod lattice;
@@ -50,6 +51,7 @@ mod sight;
 mod srgb;
 #[cfg(test)]
 mod tests_support;
+mod voxel;
 mod walk;
 
 pub use lanes::Width;

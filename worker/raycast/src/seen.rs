@@ -5,6 +5,7 @@ use terrafarm_common::quality::Method;
 use terrafarm_common::region::Region;
 
 /// Depths, pixel by pixel, and what they took.
+#[derive(Debug, Clone)]
 pub(crate) struct Seen {
     /// One over the depth of what the ray through the pixel's centre sees, per metre: 0 for
     /// the sky, NaN where a tile is missing. See [`crate::Depths::inverse_depth`].
