@@ -67,7 +67,8 @@ fn main() {
             assert!(sum.is_finite());
             traced.expect("all tiles are loaded")
         });
-        let (frame_s, rendered) = best(runs, || render(&resident, &pyramid, &view, frame).expect("exact fits"));
+        let (frame_s, rendered) =
+            best(runs, || render(&resident, &pyramid, &view, frame).expect("exact fits"));
         assert!(rendered.missing.is_empty());
         let pixels = f64::from(size.0) * f64::from(size.1);
         println!(

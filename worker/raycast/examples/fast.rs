@@ -75,14 +75,18 @@ fn main() {
             let (mut sky, mut nan) = (0, 0);
             for y in (3..1080u32).step_by(7) {
                 for x in (2..1920u32).step_by(5) {
-                    let (a, t) = (answer.distance_m(&view, x, y) as f32, truth.distance_m(&view, x, y) as f32);
+                    let (a, t) = (
+                        answer.distance_m(&view, x, y) as f32,
+                        truth.distance_m(&view, x, y) as f32,
+                    );
                     if a.is_nan() {
                         nan += 1;
                     } else if a.is_finite() != t.is_finite() {
                         sky += 1;
                         errors.push(99.0);
                     } else if a.is_finite() {
-                        let ray = view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5).normalize();
+                        let ray =
+                            view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5).normalize();
                         let p = eye + ray * f64::from(a);
                         let ground = height(&resident, p.x, p.y);
                         errors.push(((p.z - ground).abs() * view.camera.focal_px()) / f64::from(a));

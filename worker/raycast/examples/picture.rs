@@ -55,7 +55,8 @@ fn main() {
         },
         quality: Quality { samples_per_side: number(5, 1.0) as u32, ..Quality::default() },
     };
-    let rendered = render(&resident, &pyramid, &view, Region::whole(SIZE.0, SIZE.1)).expect("exact fits");
+    let rendered =
+        render(&resident, &pyramid, &view, Region::whole(SIZE.0, SIZE.1)).expect("exact fits");
     assert!(rendered.missing.is_empty());
     println!("{:?}", rendered.stats);
     let file = std::fs::File::create(path).expect("the picture can be created");

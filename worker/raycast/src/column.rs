@@ -89,7 +89,8 @@ impl Kernel for Columns<'_, '_> {
             answers: Vec::new(),
             breaks: Vec::new(),
             own_breaks: Vec::new(),
-            width: 0, first_ray: 0,
+            width: 0,
+            first_ray: 0,
             first_line: 0,
         };
         let mut alone = Vec::new();
@@ -131,8 +132,13 @@ impl Kernel for Columns<'_, '_> {
         }
         seen.alone = alone.len() as u64;
         seen.rays += seen.alone;
-        seen.steps +=
-            cast_pixels::<L>(self.relief, self.camera, self.region, &alone, &mut seen.inverse_depth);
+        seen.steps += cast_pixels::<L>(
+            self.relief,
+            self.camera,
+            self.region,
+            &alone,
+            &mut seen.inverse_depth,
+        );
         seen
     }
 }
@@ -177,9 +183,10 @@ fn parts(region: Region, by_rows: bool) -> impl Iterator<Item = [Range<u32>; 2]>
     let columns = region.x..region.x + region.width;
     let rows = region.y..region.y + region.height;
     let (minors, majors) = if by_rows { (columns, rows) } else { (rows, columns) };
-    minors.clone().step_by(WIDEST_PX as usize).map(move |start| {
-        [start..(start + WIDEST_PX).min(minors.end), majors.clone()]
-    })
+    minors
+        .clone()
+        .step_by(WIDEST_PX as usize)
+        .map(move |start| [start..(start + WIDEST_PX).min(minors.end), majors.clone()])
 }
 
 /// For each row of a band within a part its pixels, and the lines that they lie between.
@@ -414,8 +421,7 @@ impl Columns<'_, '_> {
         let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
         for _ in 0..CORRECTIONS {
             let depth = one.div(answer);
-            let (solid, ground, slopes) =
-                self.relief.surface::<L>([x * depth, y * depth], left);
+            let (solid, ground, slopes) = self.relief.surface::<L>([x * depth, y * depth], left);
             let (height, rise) = if self.relief.curvature == 0.0 {
                 (z * depth, z)
             } else {

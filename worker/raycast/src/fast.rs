@@ -3,10 +3,12 @@
 use crate::View;
 use crate::column::{self, Columns};
 use crate::field::Field;
+use crate::frustum;
 use crate::lanes::{self, Width};
 use crate::lod::Lod;
 use crate::relief::Relief;
 use crate::seen::{Seen, Unfit};
+use crate::voxel;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{self, Quality};
 use terrafarm_common::region::Region;
@@ -33,6 +35,8 @@ pub(crate) enum Look {
 pub(crate) enum Method {
     Lod,
     Column,
+    Frustum,
+    Voxel,
 }
 
 impl Look {
@@ -47,6 +51,8 @@ impl Look {
         match method {
             quality::Method::Lod => fast(Method::Lod),
             quality::Method::Column => fast(Method::Column),
+            quality::Method::Frustum => Ok(Look::Fast(Method::Frustum)),
+            quality::Method::Voxel => Ok(Look::Fast(Method::Voxel)),
             quality::Method::Auto if why.is_none() && tolerance_px >= LEAST_FOR_COLUMN_PX => {
                 Ok(Look::Fast(Method::Column))
             }
@@ -80,18 +86,20 @@ pub(crate) fn see(
     method: Method,
     width: Width,
 ) -> Result<(Seen, Vec<TileKey>), Unfit> {
+    match method {
+        Method::Frustum => return frustum::see(field, view, region),
+        Method::Voxel => return voxel::see(field, view, region),
+        Method::Lod | Method::Column => {}
+    }
     let tolerance_px = view.quality.tolerance_px;
     let share = if method == Method::Column { column::LEVELS } else { 1.0 };
     let relief = Relief::new(field, view, share * tolerance_px);
     let (relief, camera) = (&relief, &view.camera);
-    let seen = match method {
-        Method::Lod => {
-            let slack = relief.tolerance;
-            lanes::run(Lod { field, relief, view, region, slack }, width)
-        }
-        Method::Column => {
-            lanes::run(Columns { relief, camera, tolerance_px, region }, width)
-        }
+    let seen = if method == Method::Column {
+        lanes::run(Columns { relief, camera, tolerance_px, region }, width)
+    } else {
+        let slack = relief.tolerance;
+        lanes::run(Lod { field, relief, view, region, slack }, width)
     };
     Ok((seen, relief.wanted()))
 }
@@ -103,6 +111,7 @@ pub(crate) fn supersampled(view: &View, region: Region, samples: u32) -> (View, 
     fine.camera.width *= samples;
     fine.camera.height *= samples;
     fine.quality.tolerance_px *= f64::from(samples);
+    fine.quality.samples_per_side = 1;
     let Region { x, y, width, height } = region;
     let [x, y, width, height] = [x, y, width, height].map(|length| length * samples);
     (fine, Region { x, y, width, height })

@@ -91,7 +91,8 @@ impl Frame {
         let [minor, major, w] = self.v;
         let range = |at: f64, size: u32| {
             let (low, high) = (at / w - NEAREST_PX - 2.0, at / w + NEAREST_PX + 2.0);
-            let range = low.clamp(0.0, f64::from(size)) as u32..high.clamp(0.0, f64::from(size)) as u32;
+            let range =
+                low.clamp(0.0, f64::from(size)) as u32..high.clamp(0.0, f64::from(size)) as u32;
             (!range.is_empty()).then_some(range)
         };
         let (minor, major) = (range(minor, self.size[0])?, range(major, self.size[1])?);
@@ -115,10 +116,11 @@ impl Frame {
                 let apart = self.apart(middle(row));
                 if positive { apart > near } else { apart < -near }
             };
-            let (first, end) = match ((0..last).find(|&row| on_side(row)), (0..last).rfind(|&row| on_side(row))) {
-                (Some(first), Some(end)) => (first, end + 1),
-                _ => continue,
-            };
+            let (first, end) =
+                match ((0..last).find(|&row| on_side(row)), (0..last).rfind(|&row| on_side(row))) {
+                    (Some(first), Some(end)) => (first, end + 1),
+                    _ => continue,
+                };
             let mut rest = first..end;
             while !rest.is_empty() {
                 let (low, high) =
@@ -127,11 +129,17 @@ impl Frame {
                 let far_first = low >= high;
                 let inside = |row: &u32| self.apart(middle(*row)).abs() >= half;
                 if far_first {
-                    let cut = rest.clone().take_while(inside).last().map_or(rest.start, |row| row) + 1;
+                    let cut =
+                        rest.clone().take_while(inside).last().map_or(rest.start, |row| row) + 1;
                     bands.push(Band { rows: rest.start..cut, falling: false });
                     rest.start = cut;
                 } else {
-                    let cut = rest.clone().rev().take_while(inside).last().map_or(rest.end - 1, |row| row);
+                    let cut = rest
+                        .clone()
+                        .rev()
+                        .take_while(inside)
+                        .last()
+                        .map_or(rest.end - 1, |row| row);
                     bands.push(Band { rows: cut..rest.end, falling: true });
                     rest.end = cut;
                 }

@@ -56,10 +56,10 @@ mod walk;
 
 pub use lanes::Width;
 pub use progress::{Progress, Rendered, Stats};
-pub use seen::Unfit;
-pub use sight::{Depths, Hit, Missing, Unseen, cast, depths, trace};
 pub use pyramid::Pyramid;
+pub use seen::Unfit;
 pub use shade::shade;
+pub use sight::{Depths, Hit, Missing, Unseen, cast, depths, trace};
 
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;

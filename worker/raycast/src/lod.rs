@@ -122,9 +122,7 @@ fn cast_from<L: Lanes>(
         let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
         let mut ray = [zero; 3];
         for n in 0..3 {
-            ray[n] = L::F::splat(corner[n])
-                + x * L::F::splat(right[n])
-                + y * L::F::splat(down[n]);
+            ray[n] = L::F::splat(corner[n]) + x * L::F::splat(right[n]) + y * L::F::splat(down[n]);
         }
         let across = (ray[0] * ray[0] + ray[1] * ray[1]).sqrt();
         let across = across.max(L::F::splat(STRAIGHT_DOWN));

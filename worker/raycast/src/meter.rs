@@ -37,8 +37,8 @@
 
 use crate::exact::Exact;
 use crate::field::{Contact, Field, Outcome};
-use crate::path::{Ground, Path};
 use crate::painter::path;
+use crate::path::{Ground, Path};
 use crate::pyramid::Pyramid;
 use crate::{Missing, View};
 use glam::DVec3;

@@ -69,7 +69,8 @@ impl Land {
     }
 
     pub(crate) fn render(&self, view: &View, region: Region) -> Rendered {
-        let rendered = render(&self.resident, &self.pyramid, view, region).expect("the method fits");
+        let rendered =
+            render(&self.resident, &self.pyramid, view, region).expect("the method fits");
         assert!(rendered.missing.is_empty(), "all tiles are loaded");
         rendered
     }

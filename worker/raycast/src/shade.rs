@@ -212,8 +212,7 @@ impl<'a> Shader<'a> {
         }
         let size = L::F::load(&batch.size[at..]);
         let along = batch.along::<L>(at);
-        let found =
-            slope::slopes::<L>(&mut self.heights, along, size, ground, &mut self.wanted);
+        let found = slope::slopes::<L>(&mut self.heights, along, size, ground, &mut self.wanted);
         found.slopes[0].store(&mut batch.slopes[0][at..]);
         found.slopes[1].store(&mut batch.slopes[1][at..]);
         batch.unsure[n] = found.unsure.bits();
@@ -291,11 +290,9 @@ impl<'a> Shader<'a> {
         let open = covered.lt(L::F::splat(COVERED));
         if open.any() {
             let bare = match self.bare_ground {
-                Some(color) => [
-                    L::F::splat(color[0]),
-                    L::F::splat(color[1]),
-                    L::F::splat(color[2]),
-                ],
+                Some(color) => {
+                    [L::F::splat(color[0]), L::F::splat(color[1]), L::F::splat(color[2])]
+                }
                 None => tint::tint::<L>(L::F::splat(self.lens.eye_z) + over, slopes),
             };
             let uncovered = L::F::splat(1.0) - covered;
@@ -438,8 +435,7 @@ impl Sunlight {
     fn light<L: Lanes>(&self, slopes: [L::F; 2]) -> L::F {
         let [x, y, z] = self.direction;
         let steep = slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0);
-        let facing =
-            L::F::splat(z) - slopes[0] * L::F::splat(x) - slopes[1] * L::F::splat(y);
+        let facing = L::F::splat(z) - slopes[0] * L::F::splat(x) - slopes[1] * L::F::splat(y);
         let facing = facing.max(L::F::splat(0.0)).div(steep.sqrt());
         let light = L::F::splat(self.ambient) + L::F::splat(self.direct) * facing;
         light.min(L::F::splat(self.most))

@@ -196,12 +196,8 @@ pub fn depths(
         if !wanted.is_empty() {
             return Err(Unseen::Missing(wanted));
         }
-        let stats = Stats {
-            rays: seen.rays,
-            steps: seen.steps,
-            fallbacks: seen.alone,
-            ..Stats::default()
-        };
+        let stats =
+            Stats { rays: seen.rays, steps: seen.steps, fallbacks: seen.alone, ..Stats::default() };
         return Ok(Depths { region, inverse_depth: seen.inverse_depth, stats });
     }
     let mut inverse_depth = vec![0.0; region.area() as usize];

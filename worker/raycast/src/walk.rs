@@ -621,8 +621,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             // On the line by which the cell was entered the share is known.
             let entry = self.lines.crossing(self.relief, axis, (cell + one - ahead).shl(level));
             let known = L::F::select(self.lines.forward[axis], none, full);
-            from[axis] =
-                L::F::select(entry.eq(self.free), known, share.max(none).min(full));
+            from[axis] = L::F::select(entry.eq(self.free), known, share.max(none).min(full));
         }
         self.steps.post = L::I::select(lanes, post::<L>(self.cell), self.steps.post);
         self.steps.passed = L::I::select(lanes, L::I::splat(0), self.steps.passed);

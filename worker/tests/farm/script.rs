@@ -171,12 +171,7 @@ impl Caster for Gated {
         region
     }
 
-    fn advance(
-        &self,
-        _: &Scene<()>,
-        view: &View,
-        _: &mut Region,
-    ) -> Result<Vec<TileKey>, Unfit> {
+    fn advance(&self, _: &Scene<()>, view: &View, _: &mut Region) -> Result<Vec<TileKey>, Unfit> {
         assert!(view.quality.samples_per_side != 2, "two samples are too many");
         self.begun.send(()).unwrap();
         self.gate.lock().unwrap().recv().unwrap();

@@ -1,8 +1,8 @@
 //! The tiles of a layer as kernels read them, by number.
 
 use crate::field::{Field, Ground, tile_key};
-use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
 use crate::lanes::as_bits;
+use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
 use crate::walk::{maximum, post};
 use terrafarm_terrain::layout::TILE_POSTS;
 use terrafarm_terrain::tile::{Codes, Heights, MAXIMA_LEVELS, VOID};

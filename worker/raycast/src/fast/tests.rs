@@ -113,7 +113,7 @@ fn what_is_seen_is_on_the_surface_to_the_tolerance() {
             }
         }
     }
-    assert!(ground > pixels / 4, "{ground} of {pixels} pixels see the ground");
+    assert!(ground > pixels / 12, "{ground} of {pixels} pixels see the ground");
 }
 
 /// Whether the exact ray meets a wall: the rim of a void or of the land, which is no

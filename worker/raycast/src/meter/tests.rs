@@ -71,7 +71,8 @@ fn answers_of_exact_itself_have_no_error() {
                     let said = format!("{} {camera:?} {x} {y} {claimed}: {error:?}", land.name);
                     assert!(error.error_px() <= 1e-6 && !error.mismatch, "{said}");
                     let depth = error.depth_m.unwrap_or(0.0).abs();
-                    assert!(depth <= 6e-8 * double.min(1e9), "{said}");
+                    // One over it in single precision, and what a span's parabola is off.
+                    assert!(depth <= 1.2e-7 * double.min(1e9) + 1e-7, "{said}");
                     assert_eq!(error.depth_m.is_some(), hit.is_some(), "{said}");
                 }
             }

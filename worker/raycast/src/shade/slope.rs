@@ -7,8 +7,8 @@
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
 use crate::field::Wanted;
-use crate::lanes::{Floats, Ints, Lanes, Mask};
 use crate::lanes::as_bits;
+use crate::lanes::{Floats, Ints, Lanes, Mask};
 use terrafarm_terrain::layout::TILE_POSTS;
 use terrafarm_terrain::tile::{Codes, Floats as Floats32, HeightTile, Heights, VOID};
 

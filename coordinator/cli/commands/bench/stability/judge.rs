@@ -19,7 +19,8 @@ pub fn cell(scene: &Scene, quality: Quality) -> Cell {
         Ok(answer) => answer,
         Err(kernel::Refusal(why)) => return Cell::refused(scene.name, method, why),
     };
-    let odd = answer.inverse_depth.iter().filter(|inverse| inverse.is_nan() || **inverse < 0.0).count();
+    let odd =
+        answer.inverse_depth.iter().filter(|inverse| inverse.is_nan() || **inverse < 0.0).count();
     if odd > 0 {
         return Cell::measured(scene.name, method, odd as f64, 0.0, "pixels not a distance");
     }
