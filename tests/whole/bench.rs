@@ -80,7 +80,7 @@ fn the_chart_of_speed_and_accuracy_has_every_method_and_both_forms() {
 }
 
 #[test]
-fn the_stability_suite_finds_exact_and_reference_in_bound_everywhere() {
+fn no_method_is_silently_wrong_in_any_scene_of_the_stability_suite() {
     let dir = Dir::new();
     let report = dir.path("stability.json");
     let mut command = terrafarm();
@@ -88,15 +88,11 @@ fn the_stability_suite_finds_exact_and_reference_in_bound_everywhere() {
     let ended = ended.output().unwrap();
     let report = json(&report);
     let cells = report["cells"].as_array().unwrap();
-    for cell in cells {
-        let method = cell["method"].as_str().unwrap();
-        if ["exact", "reference", "flight", "hillshade"].contains(&method) {
-            assert_ne!(cell["outcome"], "silent", "{cell}");
-        }
-    }
     let scenes: std::collections::BTreeSet<_> =
         cells.iter().map(|cell| cell["scene"].as_str().unwrap()).collect();
     assert!(scenes.len() >= 30, "{scenes:?}");
-    let silent = cells.iter().filter(|cell| cell["outcome"] == "silent").count();
-    assert_eq!(ended.status.code(), Some(i32::from(silent > 0)));
+    for cell in cells {
+        assert_ne!(cell["outcome"], "silent", "{cell}");
+    }
+    assert_eq!(ended.status.code(), Some(0));
 }

@@ -1,6 +1,7 @@
 //! `terrafarm compare`: how far two pictures, or two sequences of pictures, are apart.
 
-use crate::input::picture;
+mod picture;
+
 use crate::{Outcome, args, progress};
 use anyhow::{Context, bail};
 use serde_json::{Value, json};

@@ -5,7 +5,6 @@
 
 pub mod csv;
 pub mod flight;
-pub mod picture;
 pub mod scene;
 
 use std::fmt;

@@ -165,15 +165,18 @@ impl Net {
             let same = (high * neighbours).le(low);
             L::F::select(same, zero, one).store(&mut own_breaks[at..]);
         }
-        for at in (1..count).step_by(L::N) {
-            let mut worst = zero;
-            let above = if at > width { at - width } else { at };
-            for row in [above, at, at + width] {
-                for place in [row - 1, row, row + 1] {
-                    worst = worst.max(L::F::load(&own_breaks[place..]));
+        for row in (0..count).step_by(width.max(1)) {
+            let above = row.saturating_sub(width);
+            // What a vector writes beyond the end of the row is written again by the next.
+            for column in (1..width).step_by(L::N) {
+                let mut worst = zero;
+                for row in [above, row, row + width] {
+                    for place in [row + column - 1, row + column, row + column + 1] {
+                        worst = worst.max(L::F::load(&own_breaks[place..]));
+                    }
                 }
+                worst.store(&mut breaks[row + column..]);
             }
-            worst.store(&mut breaks[at..]);
         }
     }
 }

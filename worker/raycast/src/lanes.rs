@@ -179,21 +179,29 @@ pub enum Width {
 impl Width {
     /// Every width that this processor has, narrowest first.
     pub fn available() -> Vec<Width> {
-        let mut widths = vec![Width::One];
-        #[cfg(target_arch = "x86_64")]
-        {
-            if std::arch::is_x86_feature_detected!("avx2") {
-                widths.push(Width::Eight);
-            }
-            let wide = std::arch::is_x86_feature_detected!("avx512f")
-                && std::arch::is_x86_feature_detected!("avx512bw")
-                && std::arch::is_x86_feature_detected!("avx512dq")
-                && std::arch::is_x86_feature_detected!("avx512vl");
-            if wide && widths.contains(&Width::Eight) {
-                widths.push(Width::Sixteen);
+        let widths = [Width::One, Width::Eight, Width::Sixteen];
+        widths.into_iter().filter(|width| width.is_available()).collect()
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    fn is_available(self) -> bool {
+        use std::arch::is_x86_feature_detected as has;
+        // What the kernels are compiled for besides; see `avx2::run` and `avx512::run`.
+        let common = || has!("popcnt") && has!("bmi1") && has!("bmi2") && has!("lzcnt");
+        let eight = || has!("avx2") && common();
+        match self {
+            Width::One => true,
+            Width::Eight => eight(),
+            Width::Sixteen => {
+                let wide = has!("avx512f") && has!("avx512bw");
+                eight() && wide && has!("avx512dq") && has!("avx512vl")
             }
         }
-        widths
+    }
+
+    #[cfg(not(target_arch = "x86_64"))]
+    fn is_available(self) -> bool {
+        self == Width::One
     }
 
     /// The name that reports use.

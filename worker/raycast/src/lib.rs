@@ -14,13 +14,18 @@
 //! walls when a ray comes upon them from below, and rays pass over voids. A camera that
 //! is at or below the surface sees the colour `below_ground` everywhere.
 //!
-//! Read in this order: [`path`](self) is the way of a ray over flat or round ground,
-//! `grid` where it crosses the lines of a layer, `cell` where it meets the surface;
-//! `reference` walks from cell to cell, `exact` finds the same contacts by skipping what
-//! lies below the ray, with maxima from [`Pyramid`], and `beam` spares it the way that all
-//! rays through a square of pixels clear; `field` says which layer holds
-//! where; `progress` turns a region into rays and `shade` contacts into colours. [`meter`] measures
-//! how far an answer is from that of `exact`.
+//! Read in this order: `path` is the way of a ray over flat or round ground, `grid` where it
+//! crosses the lines of a layer, `cell` where it meets the surface; `reference` walks from
+//! cell to cell, `exact` finds the same contacts by skipping what lies below the ray, with
+//! maxima from [`Pyramid`], and `beam` spares it the way that all rays through a square of
+//! pixels clear; `field` says which layer holds where.
+//!
+//! The fast methods, of which `fast` picks one: `relief` is the surface that they see,
+//! `walk` their rays over it, many at a time in the `lanes` of the processor; `lod` casts a
+//! ray for each pixel, `column` along the lines of `lattice`. `frustum` and `voxel` stand
+//! alone. `progress` turns a region into pixels and `shade` what was seen into colours;
+//! `sight` answers without colours, and [`meter`] measures how far an answer is from that
+//! of `exact`.
 //!
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
 //! multiplication is used in anything that ends in a pixel.

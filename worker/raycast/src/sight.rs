@@ -152,7 +152,7 @@ pub struct Depths {
     pub region: Region,
     /// One over the depth of each pixel, per metre, rows from the top; 0 for the sky. The
     /// depth is the distance along the axis of the camera: what is seen is at
-    /// `ray / inverse_depth` from the camera, with the pixel's [`Camera::ray`]. Over a round
+    /// `ray / inverse_depth` from the camera, with the pixel's ray. Over a round
     /// Earth that holds along the map.
     pub inverse_depth: Vec<f32>,
     /// What it took.

@@ -590,15 +590,16 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         self.block = L::I::select(blocks & !clear, block - one, wider);
         let mut solid = L::M::none();
         if found.any() {
-            self.arrive(soil, found);
-            solid = self.look(soil, self.free, found);
+            let start = self.arrive(soil, found);
+            solid = self.look(soil, start, found);
         }
         (solid, found)
     }
 
-    /// Readies lanes to walk from the cells that they have found.
+    /// Readies lanes to walk from the cells that they have found. Returns where their lines
+    /// enter these: not where the ray is free from, or the answer would depend on that.
     #[inline(always)]
-    fn arrive(&mut self, soil: &Soils, lanes: L::M) {
+    fn arrive(&mut self, soil: &Soils, lanes: L::M) -> L::F {
         let one = L::I::splat(1);
         let level = L::I::load(&soil.level);
         let shrink = L::F::load(&soil.shrink);
@@ -606,6 +607,12 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let first = self.first(top);
         let side = one.shl(top) - one;
         let (none, full) = (L::F::splat(0.0), L::F::splat(1.0));
+        let mut entries = [none; 2];
+        for axis in 0..2 {
+            let line = (self.cell[axis] + one - self.lines.ahead[axis]).shl(level);
+            entries[axis] = self.lines.crossing(self.relief, axis, line);
+        }
+        let start = entries[0].max(entries[1]).max(self.lines.enter);
         let mut from = [none; 2];
         for axis in 0..2 {
             let cell = self.cell[axis];
@@ -617,11 +624,11 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let rest = L::I::select(self.lines.forward[axis], side - done, done);
             self.steps.rest[axis] = L::I::select(lanes, rest, self.steps.rest[axis]);
             let corner = (cell.shl(level) - eye).to_floats();
-            let share = (self.lines.place(self.relief, axis, self.free) - corner) * shrink;
+            let share = (self.lines.place(self.relief, axis, start) - corner) * shrink;
             // On the line by which the cell was entered the share is known.
-            let entry = self.lines.crossing(self.relief, axis, (cell + one - ahead).shl(level));
             let known = L::F::select(self.lines.forward[axis], none, full);
-            from[axis] = L::F::select(entry.eq(self.free), known, share.max(none).min(full));
+            let entry = entries[axis].eq(start);
+            from[axis] = L::F::select(entry, known, share.max(none).min(full));
         }
         self.steps.post = L::I::select(lanes, post::<L>(self.cell), self.steps.post);
         self.steps.passed = L::I::select(lanes, L::I::splat(0), self.steps.passed);
@@ -638,6 +645,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let value = L::F::select(from[0].eq(full), east, value);
         let value = soil.height::<L>(value);
         self.profile.low = L::F::select(lanes, value, self.profile.low);
+        start
     }
 
     /// Reads the ground of the cells that lanes have come to at `start`, but for its height

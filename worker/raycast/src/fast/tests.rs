@@ -87,6 +87,39 @@ fn every_width_and_every_split_see_the_same_bits() {
 }
 
 #[test]
+fn strips_and_tiles_make_the_same_picture_as_the_whole() {
+    let land = hills();
+    let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+    let mut dice = Dice::new(9);
+    for round in 0..count(12) {
+        let mut camera = camera(&land, &mut dice);
+        (camera.width, camera.height) = (320, 180);
+        camera.position.z = land.pyramid.highest() + dice.between(20.0, 500.0);
+        let view = view(camera, &mut dice, quality::Method::Lod);
+        let whole = Region::whole(320, 180);
+        for method in METHODS {
+            let see = |region| {
+                see(field, &view, region, method, lanes::widest()).unwrap().0.inverse_depth
+            };
+            let truth = see(whole);
+            let (width, height) = [(32, 180), (7, 180), (24, 24), (64, 64)][(round % 4) as usize];
+            for y in (0..180).step_by(height as usize) {
+                for x in (0..320).step_by(width as usize) {
+                    let (width, height) = (width.min(320 - x), height.min(180 - y));
+                    let part = Region { x, y, width, height };
+                    for ([x, y], inverse) in part.pixels().zip(see(part)) {
+                        let truth = truth[(y * 320 + x) as usize];
+                        let said =
+                            format!("{method:?} {view:?} {part:?} {x} {y} {inverse} {truth}");
+                        assert_eq!(inverse.to_bits(), truth.to_bits(), "{said}");
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
 fn what_is_seen_is_on_the_surface_to_the_tolerance() {
     let (mut pixels, mut ground) = (0, 0);
     for (number, land) in single_layered().iter().enumerate() {

@@ -31,7 +31,7 @@ impl Lanes for Eight {
 }
 
 /// # Safety
-/// The processor must have AVX2.
+/// The processor must have AVX2, POPCNT, BMI1, BMI2 and LZCNT.
 #[target_feature(enable = "avx2,popcnt,bmi1,bmi2,lzcnt")]
 pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
     kernel.run::<Eight>()

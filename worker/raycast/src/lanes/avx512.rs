@@ -27,7 +27,7 @@ impl Lanes for Sixteen {
 }
 
 /// # Safety
-/// The processor must have AVX-512 F, BW, DQ and VL.
+/// The processor must have AVX-512 F, BW, DQ and VL, and what `avx2::run` asks for.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,popcnt,bmi1,bmi2,lzcnt")]
 pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
     kernel.run::<Sixteen>()
