@@ -13,8 +13,9 @@ use crate::field::Field;
 use crate::grid::cells_of;
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, as_bits};
 use crate::path::Ground;
+use crate::walk::post;
 use std::cell::RefCell;
-use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TILE_POSTS, TILE_RING, TileKey};
+use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TILE_POSTS, TileKey};
 use terrafarm_terrain::resident::Lookup;
 use terrafarm_terrain::tile::{HeightTile, Heights, MAXIMA_LEVELS, VOID};
 
@@ -249,11 +250,8 @@ fn corners<L: Lanes>(
     cell: [L::I; 2],
     lanes: L::M,
 ) -> (L::M, [L::F; 4]) {
-    let mask = L::I::splat(TILE_CELLS as i32 - 1);
-    let ring = L::I::splat(TILE_RING as i32);
-    let width = L::I::splat(TILE_POSTS as i32);
-    let at = ((cell[1] & mask) + ring).times(width) + (cell[0] & mask) + ring;
-    let north = at + width;
+    let at = post::<L>(cell);
+    let north = at + L::I::splat(TILE_POSTS as i32);
     match tile.heights() {
         Heights::Codes(codes) => {
             let base = L::F::splat((f64::from(codes.base) * codes.step - eye_z) as f32);

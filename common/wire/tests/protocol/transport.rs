@@ -183,6 +183,7 @@ async fn silence_is_noticed_and_a_trickle_is_not_silence() {
     let trickle = tokio::spawn(async move {
         for byte in bytes(&hello().into()) {
             near.write_all(&[byte]).await.unwrap();
+            // A slow sender is what is tested; nothing waits for a state here.
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
         near
