@@ -6,45 +6,50 @@
 //! columns are those of a camera that does not roll). `lattice` says which lines and rays
 //! there are: neighbours are about four pixels apart for each pixel of tolerance.
 //!
-//! What rays find is kept as inverse depth, which over a plane is linear in the picture. A
-//! pixel is first guessed between the four rays around it, if they see neighbouring ground,
-//! then compared with the surface at that very place: what is off by more than half the
-//! tolerance is corrected along the pixel's own ray and compared again. Where the rays see
-//! different ground, where the corrections do not settle, and close to V, the pixel has a
-//! ray of its own, that of `lod`. So every pixel shows a point of the surface, to the
-//! tolerance; what a pixel can miss is ground in front that is narrower than the distance
-//! between rays.
+//! What rays find is kept as inverse depth, which over a plane is linear in the picture.
+//! There is a ray in each row for each line, so a pixel lies between two rays. Where the
+//! rays around these bend no more than the tolerance allows, and the posts of the ground
+//! are further apart than lines, the pixel is between the two (`net`). Where they bend more
+//! it is compared with the surface at that very place, and moved along its own ray until it
+//! is there; where the two see different ground it is looked for on the nearer, then on the
+//! other (`doubts`). What is not found so, and what is close to V, has a ray of its own,
+//! that of `lod`. What a pixel can miss is ground in front that is narrower than the
+//! distance between lines.
+
+mod doubts;
+mod net;
 
 use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask, as_bits};
 use crate::lattice::{Band, Fan, Frame};
 use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
 use crate::seen::Seen;
-use crate::walk::{Lines, Rows, Slopes, Walk};
+use crate::walk::{Fineness, Lines, Rows, Walk};
+use doubts::Doubts;
 use glam::DVec2;
+use net::{BENT, BROKEN, Bends, Net};
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
 
 /// Distance between lines, pixels for each pixel of tolerance, and the least and the most.
-/// Measured (`bench core`): more lines cost more, fewer leave more pixels to rays of their
-/// own.
-const SPACING: f64 = 5.0;
+/// Measured (`bench core`): more lines cost more, fewer leave more pixels in doubt.
+const SPACING: f64 = 6.0;
 const SPACINGS: [f64; 2] = [0.5, 4.0];
-/// Rays see neighbouring ground if their depths differ by no more than this share.
-const NEIGHBOURS: f32 = 0.02;
-/// How much closer than the nearest ground seen around a pixel its own ray begins to look:
-/// a ridge may come closer between the rays around it.
-const SHARE_FREE: f32 = 0.9;
+/// How much neighbouring answers may bend for each pixel of tolerance, pixels. Measured: up
+/// to this the largest error stays what it is without.
+const BENDS: f64 = 2.0;
+/// Share of the tolerance by which the ground may be off the straight lines that rays see.
+const STRAIGHT: f64 = 0.25;
+/// A bound of the sum of the parts of a ray, up and along the map, of length 1.
+const PARTS: f64 = 1.42;
 /// Share of the tolerance by which a pixel may be off the surface without being corrected.
 /// The other half is for the surface: see [`LEVELS`].
 const ALLOWED: f64 = 0.5;
 /// Share of the tolerance by which the levels of the surface may be off level 0.
 pub(crate) const LEVELS: f64 = 0.5;
-/// How often a pixel is compared with the surface at most ...
-const CORRECTIONS: usize = 4;
-/// ... and by what share of its depth it may be moved each time.
-const FARTHEST: f32 = 0.05;
+/// Blocks of `1 << FIRST_BLOCK` cells are looked at first: whole tiles.
+const FIRST_BLOCK: i32 = 8;
 /// Lines a pixel up to which those between N pixels are no more than 2 N.
 const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
@@ -64,20 +69,6 @@ struct Span {
     lines: Range<i32>,
 }
 
-/// The rays of a part of a band, ray by ray from `first_ray`, in each line by line from
-/// `first_line`.
-struct Net {
-    answers: Vec<f32>,
-    /// By the first of the four answers around a cell of the net: 1 if here or in one of
-    /// the eight cells around the four are not of neighbouring ground, else 0.
-    breaks: Vec<f32>,
-    /// The same without the cells around.
-    own_breaks: Vec<f32>,
-    width: usize,
-    first_ray: usize,
-    first_line: i32,
-}
-
 impl Kernel for Columns<'_, '_> {
     type Output = Seen;
 
@@ -85,15 +76,7 @@ impl Kernel for Columns<'_, '_> {
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
         let mut seen = Seen::new(self.region);
-        let mut net = Net {
-            answers: Vec::new(),
-            breaks: Vec::new(),
-            own_breaks: Vec::new(),
-            width: 0,
-            first_ray: 0,
-            first_line: 0,
-        };
-        let mut alone = Vec::new();
+        let (mut net, mut doubts, mut alone) = (Net::new(), Doubts::new(), Vec::new());
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
         for by_rows in [true, false] {
@@ -109,8 +92,9 @@ impl Kernel for Columns<'_, '_> {
                         for (span, row) in filled.filter(|(span, _)| !span.pixels.is_empty()) {
                             done += span.pixels.len() as u64;
                             let rows = (row, span.pixels.clone());
-                            self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut alone);
+                            self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut doubts);
                         }
+                        self.decide::<L>(&mut doubts, &mut seen.inverse_depth, &mut alone);
                     }
                 }
             }
@@ -140,44 +124,6 @@ impl Kernel for Columns<'_, '_> {
             &mut seen.inverse_depth,
         );
         seen
-    }
-}
-
-impl Net {
-    /// Finds the cells where the picture breaks, and their neighbours.
-    #[inline(always)]
-    fn compare<L: Lanes>(&mut self) {
-        let Net { answers, breaks, own_breaks, width, .. } = self;
-        let (width, count) = (*width, answers.len());
-        // A margin for the vectors beyond the end.
-        answers.resize(count + width + 2 * MOST, 0.0);
-        for list in [&mut *breaks, &mut *own_breaks] {
-            list.clear();
-            list.resize(count + width + 2 * MOST, 0.0);
-        }
-        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
-        for at in (0..count).step_by(L::N) {
-            let (a, b) = (L::F::load(&answers[at..]), L::F::load(&answers[at + 1..]));
-            let next = if at + width < count { at + width } else { at };
-            let (c, e) = (L::F::load(&answers[next..]), L::F::load(&answers[next + 1..]));
-            let (low, high) = (a.min(b).min(c.min(e)), a.max(b).max(c.max(e)));
-            let same = (high * neighbours).le(low);
-            L::F::select(same, zero, one).store(&mut own_breaks[at..]);
-        }
-        for row in (0..count).step_by(width.max(1)) {
-            let above = row.saturating_sub(width);
-            // What a vector writes beyond the end of the row is written again by the next.
-            for column in (1..width).step_by(L::N) {
-                let mut worst = zero;
-                for row in [above, row, row + width] {
-                    for place in [row + column - 1, row + column, row + column + 1] {
-                        worst = worst.max(L::F::load(&own_breaks[place..]));
-                    }
-                }
-                worst.store(&mut breaks[row + column..]);
-            }
-        }
     }
 }
 
@@ -223,20 +169,15 @@ impl Columns<'_, '_> {
         seen: &mut Seen,
     ) {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
-        let rays = |row: u32| {
-            // The row is between ray n and ray n + 1; one more on each side to compare with.
-            let (before, _) = fan.rays(row);
-            before.saturating_sub(1)..before + 3
-        };
+        // One more on each side to compare with.
+        let rays = |row: u32| fan.ray(row).saturating_sub(1)..fan.ray(row) + 2;
         let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
         let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
         let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
         // Whole vectors are looked at, and twice as much.
         let width = (end_line - first_line) as usize + 2 * MOST;
-        net.answers.clear();
-        net.answers.resize(width * (end_ray - first_ray), 0.0);
-        (net.width, net.first_ray, net.first_line) = (width, first_ray, first_line);
+        net.clear(first_ray, end_ray - first_ray, first_line, width);
         for block in (first_line..end_line).step_by(L::N) {
             let end = block + L::N as i32;
             let meets = |(span, _): &(&Span, u32)| span.lines.start < end && span.lines.end > block;
@@ -247,7 +188,11 @@ impl Columns<'_, '_> {
                 seen.steps += self.block::<L>(frame, fan, block, low..high, net);
             }
         }
-        net.compare::<L>();
+        let bends = BENDS * self.tolerance_px;
+        net.compare::<L>(Bends {
+            of_change: bends as f32,
+            of_depth: (bends / (PARTS * self.camera.focal_px())) as f32,
+        });
     }
 
     /// Casts rays of N lines. Returns the steps that it took.
@@ -275,7 +220,7 @@ impl Columns<'_, '_> {
             }
         }
         // Rays in the order in which they rise.
-        let d = |ray: usize| (ray as f64 * fan.every) as f32;
+        let d = |ray: usize| ray as f32 * fan.towards as f32;
         let tangent = |ray: usize| {
             let [_, _, length, longer, rise, higher] = values.map(|value| value[0]);
             (rise + d(ray) * higher) / (length + d(ray) * longer)
@@ -283,7 +228,7 @@ impl Columns<'_, '_> {
         let (low, high) = (rays.start, rays.end - 1);
         let onwards = tangent(low) <= tangent(high);
         let (begin, step) = if onwards { (low, 1) } else { (high, -1) };
-        let at = (begin - net.first_ray) * net.width + (first - net.first_line) as usize;
+        let at = (begin - net.first_row) * net.width + (first - net.first_line) as usize;
         let mut places = [0; MOST];
         for (place, lane) in places.iter_mut().zip(0..) {
             *place = at as i32 + lane;
@@ -295,19 +240,24 @@ impl Columns<'_, '_> {
             rise: L::F::load(&values[4]),
             higher: L::F::load(&values[5]),
             first: d(begin),
-            step: fan.every as f32 * step as f32,
+            step: (fan.towards * step) as f32,
             count: rays.len() as i32,
             at: L::I::load(&places),
             pitch: net.width as i32 * step,
         };
         let lines = Lines::<L>::new(self.relief, [x, y]);
-        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0), 8);
+        let focal = self.camera.focal_px();
+        let fineness = Fineness {
+            straight: (STRAIGHT * self.tolerance_px / focal) as f32,
+            apart: (fan.spacing / focal) as f32,
+        };
+        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0), FIRST_BLOCK, fineness);
         walk.run(&mut net.answers);
         walk.looked
     }
 
-    /// Sees the pixels of a row between the rays around them. Those that cannot be seen so
-    /// are added to `alone`, by their place in the region.
+    /// Sees the pixels of a row between the rays around them. Those of which these do not
+    /// tell enough are added to `doubts`.
     #[inline(always)]
     fn see<L: Lanes>(
         &self,
@@ -316,65 +266,39 @@ impl Columns<'_, '_> {
         (row, pixels): (u32, Range<u32>),
         net: &Net,
         seen: &mut Seen,
-        alone: &mut Vec<Alone>,
+        doubts: &mut Doubts,
     ) {
         let d = f64::from(row) + 0.5 - fan.reference;
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
         let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
-        let scale_f = L::F::splat(scale as f32);
-        let begin = frame.corner + frame.major * (f64::from(row) + 0.5);
-        let (ray, down) = fan.rays(row);
-        let at = (ray - net.first_ray) * net.width;
-        let before = &net.answers[at..at + net.width];
-        let next = if down > 0.0 { at + net.width } else { at };
-        let after = &net.answers[next..next + net.width];
-        let breaks = &net.breaks[at..at + net.width];
-        let down = L::F::splat(down);
+        let (answers, states) = net.row(fan.ray(row));
         let numbers = L::F::load(&NUMBERS);
         let sparse = scale < DENSEST;
         let region = self.region;
         let mut places = [0; MOST];
         let mut out = [0.0f32; MOST];
-        let mut nearest = [0.0f32; MOST];
         for pixel in pixels.clone().step_by(L::N) {
             let minor = numbers + L::F::splat(pixel as f32 + 0.5);
-            let line = start + minor * scale_f;
+            let line = start + minor * L::F::splat(scale as f32);
             let left = line.floor();
             let share = line - left.to_floats();
             let left = left - L::I::splat(net.first_line);
-            let ((a, b), (c, e), broken) = if sparse {
+            let (a, b, state) = if sparse {
                 left.store(&mut places);
                 let base = places[0].max(0) as usize;
                 let left = left - L::I::splat(base as i32);
-                (
-                    looked_up::<L>(&before[base..], left),
-                    looked_up::<L>(&after[base..], left),
-                    L::F::lookup(&breaks[base..], left),
-                )
+                let (answers, states) = (&answers[base..], &states[base..]);
+                let (a, b) = (L::F::lookup(answers, left), L::F::lookup(&answers[1..], left));
+                (a, b, L::F::lookup(states, left))
             } else {
-                (
-                    gathered::<L>(before, left),
-                    gathered::<L>(after, left),
-                    gathered::<L>(breaks, left).0,
-                )
+                let (a, b) = gathered::<L>(answers, left);
+                (a, b, gathered::<L>(states, left).0)
             };
-            let high = a.max(b).max(c.max(e));
-            let close = broken.eq(L::F::splat(0.0));
-            let (above, below) = (a + (b - a) * share, c + (e - c) * share);
-            let guess = above + (below - above) * down;
+            let answer = a + (b - a) * share;
             let count = L::N.min((pixels.end - pixel) as usize);
-            let all = L::M::from_bits(u32::MAX >> (32 - count));
-            let sky = high.eq(L::F::splat(0.0));
-            let mut ray = [minor; 3];
-            for n in 0..3 {
-                ray[n] = L::F::splat(begin[n] as f32) + minor * L::F::splat(frame.minor[n] as f32);
-            }
-            let (answer, sure) = self.settle::<L>(ray, guess, close & all & !sky);
-            let close = sure | (sky & close);
-            let mut strange = (!close).bits() & (u32::MAX >> (32 - count));
-            if strange != 0 {
-                high.store(&mut nearest);
-            }
+            // The sky is never bent.
+            let doubtful = L::F::splat(BENT).le(state) & !(a.max(b).eq(L::F::splat(0.0)));
+            let doubtful = doubtful.bits() & (u32::MAX >> (32 - count));
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
@@ -384,12 +308,6 @@ impl Columns<'_, '_> {
                     answer.store(&mut out);
                     seen.inverse_depth[at..at + count].copy_from_slice(&out[..count]);
                 }
-                while strange != 0 {
-                    let lane = strange.trailing_zeros();
-                    let free = free_before(nearest[lane as usize % MOST]);
-                    alone.push(Alone { at: at as u32 + lane, free });
-                    strange &= strange - 1;
-                }
             } else {
                 answer.store(&mut out);
                 let at = (pixel - region.y) as usize * region.width as usize;
@@ -398,62 +316,25 @@ impl Columns<'_, '_> {
                 for (pixels, &answer) in rows.zip(&out[..count]) {
                     pixels[column] = answer;
                 }
-                while strange != 0 {
-                    let lane = strange.trailing_zeros();
-                    let free = free_before(nearest[lane as usize % MOST]);
-                    let at = (at + column) as u32 + lane * region.width;
-                    alone.push(Alone { at, free });
-                    strange &= strange - 1;
+            }
+            if doubtful != 0 {
+                let broken = state.eq(L::F::splat(BROKEN));
+                let first = L::F::select(broken, a.max(b), answer);
+                let second = L::F::select(broken, a.min(b), L::F::splat(0.0));
+                let (mut firsts, mut seconds) = ([0.0; MOST], [0.0; MOST]);
+                first.store(&mut firsts);
+                second.store(&mut seconds);
+                let mut bits = doubtful;
+                while bits != 0 {
+                    let lane = bits.trailing_zeros() as usize % MOST;
+                    bits &= bits - 1;
+                    let minor = pixel + lane as u32;
+                    let place = if frame.by_rows { [minor, row] } else { [row, minor] };
+                    doubts.push(place, firsts[lane], seconds[lane]);
                 }
             }
         }
     }
-}
-
-impl Columns<'_, '_> {
-    /// Moves guesses along rays until they are on the surface. Returns which have got
-    /// there.
-    #[inline(always)]
-    fn settle<L: Lanes>(&self, ray: [L::F; 3], guess: L::F, lanes: L::M) -> (L::F, L::M) {
-        let one = L::F::splat(1.0);
-        let [x, y, z] = ray;
-        let across = x * x + y * y;
-        // The tolerance as a length at depth 1: |ray| / focal.
-        let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
-        let allowed = L::F::splat((allowed * allowed) as f32) * (across + z * z);
-        let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
-        for _ in 0..CORRECTIONS {
-            let depth = one.div(answer);
-            let (solid, ground, slopes) = self.relief.surface::<L>([x * depth, y * depth], left);
-            let (height, rise) = if self.relief.curvature == 0.0 {
-                (z * depth, z)
-            } else {
-                let length = across.sqrt();
-                let slopes = Slopes::<L>::new(self.relief, z.div(length));
-                let bend = L::F::splat(self.relief.curvature as f32) * across * depth;
-                (slopes.height(length * depth), z + bend)
-            };
-            let off = height - ground;
-            let share = off * answer;
-            sure = sure | (left & solid & (share * share).le(allowed));
-            left = left & solid & !sure;
-            if !left.any() {
-                break;
-            }
-            let closing = rise - slopes[0] * x - slopes[1] * y;
-            let corrected = one.div(depth - off.div(closing));
-            let near = (corrected - answer).abs().lt(L::F::splat(FARTHEST) * answer);
-            left = left & near;
-            answer = L::F::select(left, corrected, answer);
-        }
-        (answer, sure)
-    }
-}
-
-/// The depth from which a pixel's own ray looks for ground, if the nearest that is seen
-/// around it has this inverse depth.
-fn free_before(nearest: f32) -> f32 {
-    if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 }
 }
 
 /// The numbers of the lanes.
@@ -467,13 +348,7 @@ const NUMBERS: [f32; MOST] = {
     numbers
 };
 
-/// Elements of a row and those after them, the first less than 2 N further on.
-#[inline(always)]
-fn looked_up<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
-    (L::F::lookup(row, at), L::F::lookup(&row[1..], at))
-}
-
-/// The same, however far on they are.
+/// Elements of a row and those after them.
 #[inline(always)]
 fn gathered<L: Lanes>(row: &[f32], at: L::I) -> (L::F, L::F) {
     let (row, all) = (as_bits(row), !L::M::none());

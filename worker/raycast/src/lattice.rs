@@ -43,12 +43,12 @@ pub(crate) struct Band {
 
 /// The lines of a band and the rays on them. Line k goes through `K = (k + 1/2) spacing` in
 /// the reference row, at its middle, and through `K + d (K q - r)` d rows further on. Ray j
-/// of each line goes through the row `j every` rows from the reference row towards V.
+/// of each line goes through the j-th row from the reference row towards V.
 pub(crate) struct Fan {
     pub reference: f64,
     pub spacing: f64,
-    /// Rows from ray to ray, with the sign of the way.
-    pub every: f64,
+    /// 1 if V lies towards the end of the rows, else -1.
+    pub towards: i32,
     pub q: f64,
     pub r: f64,
 }
@@ -153,11 +153,10 @@ impl Frame {
         let first = if band.falling { band.rows.end - 1 } else { band.rows.start };
         let reference = f64::from(first) + 0.5;
         let scale = 1.0 / self.apart(reference);
-        let every = (0.5 * spacing).floor().max(1.0);
         Fan {
             reference,
             spacing,
-            every: if band.falling { -every } else { every },
+            towards: if band.falling { -1 } else { 1 },
             q: self.v[2] * scale,
             r: self.v[0] * scale,
         }
@@ -192,12 +191,10 @@ impl Frame {
 }
 
 impl Fan {
-    /// The rays that a row lies between: the one before, as a number of rays from the
-    /// reference row, and how far it is to the next, 0 to 1.
-    pub(crate) fn rays(&self, row: u32) -> (usize, f32) {
-        let place = (f64::from(row) + 0.5 - self.reference) / self.every;
-        let before = place.floor().max(0.0);
-        (before as usize, (place - before) as f32)
+    /// The ray of each line that goes through a row of the band.
+    pub(crate) fn ray(&self, row: u32) -> usize {
+        let apart = f64::from(row) + 0.5 - self.reference;
+        (apart * f64::from(self.towards)).max(0.0) as usize
     }
 
     /// The line through a point of a row, as a number that counts from line 0.

@@ -9,7 +9,7 @@ use crate::painter::squares;
 use crate::path::Ground;
 use crate::relief::Relief;
 use crate::seen::Seen;
-use crate::walk::{Lines, Rows, Walk};
+use crate::walk::{Fineness, Lines, Rows, Walk};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -25,6 +25,9 @@ const FIRST_BLOCK: i32 = 2;
 const STARTED_BELOW: f32 = 1.0 - 1e-4;
 /// Share of a depth that single precision may add to it.
 const ROUNDING: f64 = 1e-5;
+
+/// Share of the surface's tolerance by which it may be off the straight lines that rays see.
+const STRAIGHT: f64 = 0.1;
 
 /// A pixel that is to have a ray of its own.
 #[derive(Clone, Copy)]
@@ -103,6 +106,7 @@ fn cast_from<L: Lanes>(
     inverse_depth: &mut [f32],
 ) -> u64 {
     let mut steps = 0;
+    let fineness = Fineness { straight: (STRAIGHT * relief.tolerance) as f32, apart: 0.0 };
     let frame = Frame::new(camera, true);
     let part = |vector: DVec3| vector.as_vec3().to_array();
     let (corner, right, down) = (part(frame.corner), part(frame.minor), part(frame.major));
@@ -140,7 +144,7 @@ fn cast_from<L: Lanes>(
         };
         let lines = Lines::<L>::new(relief, [ray[0] * inverse, ray[1] * inverse]);
         let free = L::F::load(&values[2]) * across;
-        let mut walk = Walk::new(relief, lines, rows, free, FIRST_BLOCK);
+        let mut walk = Walk::new(relief, lines, rows, free, FIRST_BLOCK, fineness);
         walk.run(inverse_depth);
         steps += walk.looked;
     }
