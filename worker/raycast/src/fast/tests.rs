@@ -99,15 +99,19 @@ fn strips_and_tiles_make_the_same_picture_as_the_whole() {
         let whole = Region::whole(320, 180);
         for method in METHODS {
             let see = |region| {
-                see(field, &view, region, method, lanes::widest()).unwrap().0.inverse_depth
+                let (seen, _) = see(field, &view, region, method, lanes::widest()).unwrap();
+                (seen.inverse_depth, seen.alone)
             };
-            let truth = see(whole);
+            let (truth, alone) = see(whole);
+            let mut alone_in_parts = 0;
             let (width, height) = [(32, 180), (7, 180), (24, 24), (64, 64)][(round % 4) as usize];
             for y in (0..180).step_by(height as usize) {
                 for x in (0..320).step_by(width as usize) {
                     let (width, height) = (width.min(320 - x), height.min(180 - y));
                     let part = Region { x, y, width, height };
-                    for ([x, y], inverse) in part.pixels().zip(see(part)) {
+                    let (seen, alone) = see(part);
+                    alone_in_parts += alone;
+                    for ([x, y], inverse) in part.pixels().zip(seen) {
                         let truth = truth[(y * 320 + x) as usize];
                         let said =
                             format!("{method:?} {view:?} {part:?} {x} {y} {inverse} {truth}");
@@ -115,6 +119,8 @@ fn strips_and_tiles_make_the_same_picture_as_the_whole() {
                     }
                 }
             }
+            assert_eq!(alone_in_parts, alone, "{method:?} {view:?}");
+            assert!(alone == 0 || method == Method::Column);
         }
     }
 }
