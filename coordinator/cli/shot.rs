@@ -215,6 +215,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let in_flight = plan.frames_in_flight as usize;
     let (updates, inbox) = mpsc::channel(2 * in_flight + 8);
     let (taken, taken_out) = mpsc::channel(in_flight + 8);
+    let samples_per_pixel = u64::from(plan.quality.samples_per_side).pow(2);
     let bar = progress::bar("frames", u64::from(spec.frames));
     let (first_sign, begun) = oneshot::channel();
     let desk = Desk {
@@ -225,6 +226,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         first_sign: Some(first_sign),
         workers: 0,
         worst_p99_px: None,
+        samples: u64::from(camera.width) * u64::from(camera.height) * samples_per_pixel,
     };
     let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), address.clone()));
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
@@ -259,7 +261,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let written = writing.await.context("the task that writes frames ended early")?;
     bar.finish_and_clear();
     // What went wrong with a file is the cause; that the shot then stopped is not.
-    let Written { finished, records, errors, failed } = match (written, &rendered) {
+    let Written { finished, records, errors, fallbacks, failed } = match (written, &rendered) {
         (Ok(written), _) => written,
         (Err(why), Ok(_) | Err(ClientError::Stopped)) => return Err(why),
         (Err(_), Err(_)) => Written::default(),
@@ -280,6 +282,8 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         tolerance_px: method.reads_tolerance().then_some(plan.quality.tolerance_px),
         size: [spec.width, spec.height],
         fps: plan.fps,
+        fallbacks: fallbacks.count,
+        fallback_share: fallbacks.share(),
         frames: records,
         failed,
         workers: done
@@ -320,6 +324,32 @@ struct Desk {
     workers: u32,
     /// The largest 99th percentile of the errors of a frame so far, pixels.
     worst_p99_px: Option<f64>,
+    /// Samples of a frame.
+    samples: u64,
+}
+
+/// Samples that a method could not do its own way and gave a ray of their own.
+#[derive(Debug, Clone, Copy, Default)]
+struct Fallbacks {
+    count: u64,
+    of: u64,
+}
+
+impl Fallbacks {
+    /// What a worker counted, which cannot be more than there are.
+    fn new(count: u64, of: u64) -> Self {
+        Fallbacks { count: count.min(of), of }
+    }
+
+    fn add(&mut self, more: Fallbacks) {
+        self.count += more.count;
+        self.of += more.of;
+    }
+
+    /// Their share, 0 to 1.
+    fn share(self) -> f64 {
+        self.count as f64 / self.of.max(1) as f64
+    }
 }
 
 #[derive(Default)]
@@ -327,6 +357,7 @@ struct Written {
     finished: Option<Finished>,
     records: Vec<FrameEntry>,
     errors: Option<Summary>,
+    fallbacks: Fallbacks,
     failed: BTreeMap<FrameIndex, String>,
 }
 
@@ -346,7 +377,7 @@ impl Desk {
             match update {
                 Update::Progress(progress) => {
                     self.workers = progress.workers;
-                    self.say();
+                    self.say(&written);
                 }
                 Update::Frame(index, picture, facts) => order.put(index, Some((picture, facts)))?,
                 Update::FrameFailed(index, reason) => {
@@ -370,10 +401,16 @@ impl Desk {
         Ok(written)
     }
 
-    /// Says on the bar who works, and how wrong the pictures are.
-    fn say(&self) {
+    /// Says on the bar who works, how wrong the pictures are, and how much of them the
+    /// method could not do its own way.
+    fn say(&self, written: &Written) {
         let checked = self.worst_p99_px.map(|px| format!(", error p99 up to {px:.2} px"));
-        self.bar.set_message(format!("on {} workers{}", self.workers, checked.unwrap_or_default()));
+        let fallbacks = written.fallbacks;
+        let alone = (fallbacks.count > 0).then(|| {
+            format!(", {:.1} % of pixels by rays of their own", 100.0 * fallbacks.share())
+        });
+        let [checked, alone] = [checked, alone].map(Option::unwrap_or_default);
+        self.bar.set_message(format!("on {} workers{checked}{alone}", self.workers));
     }
 
     fn put(
@@ -399,14 +436,18 @@ impl Desk {
             written.errors.get_or_insert_default().merge(errors);
             let p99_px = error_px.map(|error| error.p99);
             self.worst_p99_px = p99_px.into_iter().chain(self.worst_p99_px).reduce(f64::max);
-            self.say();
         }
+        let fallbacks = Fallbacks::new(facts.fallbacks, self.samples);
+        written.fallbacks.add(fallbacks);
+        self.say(written);
         written.records.push(FrameEntry {
             index: self.first + index,
             sha256: sink::pixels_sha256(&picture).to_hex(),
             ms: facts.elapsed_us as f64 / 1e3,
             render_ms: facts.cost_us as f64 / 1e3,
             jobs: facts.jobs,
+            fallbacks: fallbacks.count,
+            fallback_share: fallbacks.share(),
             below_ground: facts.below_ground,
             error_px_p99: error_px.map(|error| error.p99),
             error_px_max: error_px.map(|error| error.max),

@@ -72,6 +72,8 @@ pub struct FrameFacts {
     pub cost_us: u64,
     /// From the first grant to the last pixels, microseconds.
     pub elapsed_us: u64,
+    /// Samples that the method could not do its own way and gave a ray of their own.
+    pub fallbacks: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
     /// The errors of the pixels that were measured, if any were to be.
@@ -248,6 +250,7 @@ impl Talk {
             jobs: frame.jobs,
             cost_us: frame.report.cost_us,
             elapsed_us: frame.elapsed_us,
+            fallbacks: frame.report.fallbacks,
             below_ground: frame.report.below_ground,
             check: frame.check,
         };

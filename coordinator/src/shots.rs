@@ -351,5 +351,6 @@ fn add(sum: &mut RenderReport, part: &RenderReport) {
     sum.cost_us = sum.cost_us.saturating_add(part.cost_us);
     sum.rays = sum.rays.saturating_add(part.rays);
     sum.steps = sum.steps.saturating_add(part.steps);
+    sum.fallbacks = sum.fallbacks.saturating_add(part.fallbacks);
     sum.below_ground |= part.below_ground;
 }

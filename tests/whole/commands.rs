@@ -103,6 +103,37 @@ fn a_check_measures_the_same_pixels_however_frames_are_split() {
 }
 
 #[test]
+fn the_manifest_counts_the_fallbacks_of_a_frame_however_it_is_split() {
+    let world = World::new(200);
+    let render = |name: &str, more: &[&str]| {
+        let output = world.dir.path(name);
+        let mut command = world.render();
+        let arguments = ["--size", "96x54", "--frames", "0..2", "--workers", "1", "--samples", "2"];
+        let said = succeed(command.args(arguments).args(more).arg("-o").arg(&output));
+        let manifest = fs::read(output.join("manifest.json")).unwrap();
+        (said, serde_json::from_slice::<serde_json::Value>(&manifest).unwrap())
+    };
+    let (said, columns) = render("columns", &["--method", "column"]);
+    assert!(said.contains("% of the pixels were not done the method's own way"), "{said}");
+    let (_, tiles) = render("tiles", &["--method", "column", "--split", "tiles:16"]);
+    let mut sum = 0;
+    for index in 0..2 {
+        let [columns, tiles] = [&columns, &tiles].map(|manifest| &manifest["frames"][index]);
+        let count = columns["fallbacks"].as_u64().unwrap();
+        assert_eq!(tiles["fallbacks"], count);
+        assert_eq!(columns["fallback_share"], count as f64 / (4 * 96 * 54) as f64);
+        assert!((1..4 * 96 * 54).contains(&count), "{count}");
+        sum += count;
+    }
+    assert_eq!(columns["fallbacks"], sum);
+    assert_eq!(columns["fallback_share"], sum as f64 / (2 * 4 * 96 * 54) as f64);
+    let (said, exact) = render("exact", &["--method", "exact", "--json"]);
+    assert_eq!((&exact["fallbacks"], &exact["fallback_share"]), (&0.into(), &0.0.into()));
+    let said: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said["fallbacks"], 0);
+}
+
+#[test]
 fn the_slow_twin_makes_the_same_picture() {
     let world = World::new(60);
     let render = |method: &str| {

@@ -260,6 +260,7 @@ impl<C: Caster> Job<C> {
             stats.rays += rendered.stats.rays;
             stats.steps += rendered.stats.steps;
             stats.hits += rendered.stats.hits;
+            stats.fallbacks += rendered.stats.fallbacks;
             stats.below_ground |= rendered.stats.below_ground;
             errors.merge(&piece.errors);
         }

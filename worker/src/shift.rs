@@ -386,6 +386,7 @@ fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<Done, Stri
         cost_us: picture.spent.as_micros() as u64,
         rays: picture.stats.rays,
         steps: picture.stats.steps,
+        fallbacks: picture.stats.fallbacks,
         below_ground: picture.stats.below_ground,
     };
     Ok(Done { lease, report, check: picture.errors, pixels })

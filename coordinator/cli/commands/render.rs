@@ -122,6 +122,8 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
             "seconds": report.seconds,
             "frames_per_s": report.frames_per_s(),
             "workers": report.manifest.workers.len(),
+            "fallbacks": report.manifest.fallbacks,
+            "fallback_share": report.manifest.fallback_share,
             "check": report.errors.as_ref().map(check_json),
         });
         println!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
@@ -137,6 +139,12 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
     );
     if let Some(errors) = &report.errors {
         print_check(errors);
+    }
+    if report.manifest.fallbacks > 0 {
+        println!(
+            "{:.2} % of the pixels were not done the method's own way but by rays of their own",
+            100.0 * report.manifest.fallback_share
+        );
     }
     println!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());
     if report.manifest.frames.iter().any(|frame| frame.below_ground) {

@@ -93,7 +93,8 @@ fn grants(out: &[Out]) -> Vec<(WorkerId, Grant)> {
 
 fn done(grant: &Grant) -> Done {
     let pixels = vec![grant.lease.0 as u8; grant.region.area() as usize * 3];
-    let report = RenderReport { cost_us: 500, rays: 1, steps: 1, below_ground: false };
+    let report =
+        RenderReport { cost_us: 500, rays: 1, steps: 1, fallbacks: 3, below_ground: false };
     let mut errors = Summary::default();
     let error = PixelError {
         surface_px: f64::from(grant.region.x),
@@ -119,6 +120,8 @@ fn render_all(bench: &mut Bench, mut out: Vec<Out>) -> Vec<(u32, Rgb8)> {
                 let frame = head.with(Pixels::raw(Bytes::new()).unwrap());
                 let errors = frame.check.unwrap();
                 assert_eq!(errors.samples(), u64::from(frame.jobs), "one error a job");
+                let fallbacks = frame.report.fallbacks;
+                assert_eq!(fallbacks, 3 * u64::from(frame.jobs), "three fallbacks a job");
                 next.extend(bench.say(
                     Peer::Client(CLIENT),
                     terrafarm_wire::message::FrameTaken { shot: frame.shot, frame: frame.frame },

@@ -37,6 +37,13 @@ pub struct Manifest {
     pub size: [u32; 2],
     /// Frames per second.
     pub fps: f64,
+    /// Samples of all frames that the method could not do its own way and gave a ray of
+    /// their own: what `column` does where neighbouring rays see different ground.
+    #[serde(default)]
+    pub fallbacks: u64,
+    /// Their share of all samples, 0 to 1: of the pixels, if `samples` is 1.
+    #[serde(default)]
+    pub fallback_share: f64,
     /// The frames, in order; those that failed are left out.
     pub frames: Vec<FrameEntry>,
     /// Frames that could not be rendered, and why.
@@ -69,6 +76,12 @@ pub struct FrameEntry {
     pub render_ms: f64,
     /// Number of jobs it was made of.
     pub jobs: u32,
+    /// As [`Manifest::fallbacks`], of this frame.
+    #[serde(default)]
+    pub fallbacks: u64,
+    /// As [`Manifest::fallback_share`], of this frame.
+    #[serde(default)]
+    pub fallback_share: f64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
     /// With `--check`: 99th percentile of the error, pixels.

@@ -358,6 +358,8 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
         ms: 12.5,
         render_ms: 20.0,
         jobs: 3,
+        fallbacks: 1,
+        fallback_share: 0.25,
         below_ground: false,
         error_px_p99: Some(0.25),
         error_px_max: Some(0.5),
@@ -378,6 +380,8 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
         tolerance_px: None,
         size: [2, 2],
         fps: 25.0,
+        fallbacks: 1,
+        fallback_share: 0.25,
         frames: vec![frame],
         failed: [(1, "no such tile".to_string())].into(),
         workers: Vec::new(),
@@ -386,13 +390,21 @@ fn the_manifest_lies_with_the_output_and_keeps_the_promised_keys() {
     let text = fs::read(path).unwrap();
     assert_eq!(serde_json::from_slice::<Manifest>(&text).unwrap(), manifest);
     let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
-    for key in ["scene", "method", "size", "frames", "program"] {
+    for key in ["scene", "method", "size", "frames", "program", "fallbacks", "fallback_share"] {
         assert!(json.get(key).is_some(), "{key}");
     }
     assert!(json["frames"][0].get("depth_error_m_p99").is_none(), "what is not known is not there");
-    for key in
-        ["index", "sha256", "ms", "error_px_p99", "error_px_max", "mismatch", "checked_pixels"]
-    {
+    for key in [
+        "index",
+        "sha256",
+        "ms",
+        "fallbacks",
+        "fallback_share",
+        "error_px_p99",
+        "error_px_max",
+        "mismatch",
+        "checked_pixels",
+    ] {
         assert!(json["frames"][0].get(key).is_some(), "{key}");
     }
     assert_eq!(names(folder.path()), ["manifest.json"]);

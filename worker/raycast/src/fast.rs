@@ -43,7 +43,7 @@ impl Look {
     /// What a view asks for; `auto` takes the cheapest that its tolerance allows.
     pub(crate) fn of(field: Field, view: &View) -> Result<Look, Unfit> {
         let Quality { method, tolerance_px, .. } = view.quality;
-        let why = unfit(field.index());
+        let why = unfit(field.index()).or(doubtful(field));
         let fast = |fast: Method| match why {
             None => Ok(Look::Fast(fast)),
             Some(why) => Err(Unfit { method, why: why.into(), instead: quality::Method::Exact }),
@@ -58,6 +58,10 @@ impl Look {
             }
             quality::Method::Auto if why.is_none() && tolerance_px >= LEAST_FOR_LOD_PX => {
                 Ok(Look::Fast(Method::Lod))
+            }
+            // Slow for ever is no answer to a store that can be mended.
+            quality::Method::Auto if tolerance_px >= LEAST_FOR_LOD_PX && why == doubtful(field) => {
+                fast(Method::Lod)
             }
             quality::Method::Auto => Ok(Look::RayByRay(quality::Method::Exact)),
             other => Ok(Look::RayByRay(other)),
@@ -76,6 +80,14 @@ fn unfit(index: &StoreIndex) -> Option<&'static str> {
         }
         _ => None,
     }
+}
+
+/// Why the levels of a store cannot be used.
+fn doubtful(field: Field) -> Option<&'static str> {
+    (!field.pyramid.deviations_hold).then_some(
+        "the store does not say how far its coarser levels are from the finest, or says it \
+         wrongly; make it again with \"terrafarm terrain import\" or \"terrafarm terrain synth\"",
+    )
 }
 
 /// Sees a region. Also returns the tiles that were missing, sorted.

@@ -17,6 +17,7 @@ mod one;
 
 pub(crate) use one::One;
 
+use std::cell::Cell;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 use std::sync::OnceLock;
 
@@ -204,6 +205,20 @@ impl Width {
         self == Width::One
     }
 
+    /// Runs something as on a processor that has no wider lanes. Only this thread is
+    /// concerned, and only until the end.
+    pub fn at_most<R>(self, run: impl FnOnce() -> R) -> R {
+        struct Restore(Option<Width>);
+        impl Drop for Restore {
+            fn drop(&mut self) {
+                LIMIT.set(self.0);
+            }
+        }
+        let limit = LIMIT.get().map_or(self, |limit| limit.min(self));
+        let _restore = Restore(LIMIT.replace(Some(limit)));
+        run()
+    }
+
     /// The name that reports use.
     pub fn name(self) -> &'static str {
         match self {
@@ -214,10 +229,17 @@ impl Width {
     }
 }
 
-/// The widest that this processor has.
+thread_local! {
+    /// What [`Width::at_most`] allows.
+    static LIMIT: Cell<Option<Width>> = const { Cell::new(None) };
+}
+
+/// The widest that this processor has and [`Width::at_most`] allows.
 pub(crate) fn widest() -> Width {
-    static WIDEST: OnceLock<Width> = OnceLock::new();
-    *WIDEST.get_or_init(|| Width::available().pop().unwrap_or(Width::One))
+    static AVAILABLE: OnceLock<Vec<Width>> = OnceLock::new();
+    let available = AVAILABLE.get_or_init(Width::available);
+    let allowed = |width: &&Width| LIMIT.get().is_none_or(|limit| **width <= limit);
+    available.iter().rev().find(allowed).copied().unwrap_or(Width::One)
 }
 
 /// Work that is written for any width.
@@ -246,4 +268,21 @@ pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
 pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
     // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.
     unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_of_the_width_holds_on_its_thread_until_its_end() {
+        let whole = widest();
+        Width::One.at_most(|| {
+            assert_eq!(widest(), Width::One);
+            assert_eq!(Width::Sixteen.at_most(widest), Width::One, "a limit within a limit");
+            std::thread::spawn(move || assert_eq!(widest(), whole)).join().expect("it is free");
+        });
+        assert!(std::panic::catch_unwind(|| Width::One.at_most(|| panic!("on purpose"))).is_err());
+        assert_eq!((widest(), Width::Sixteen.at_most(widest)), (whole, whole));
+    }
 }

@@ -20,7 +20,7 @@
 //! maxima from [`Pyramid`], and `beam` spares it the way that all rays through a square of
 //! pixels clear; `field` says which layer holds where.
 //!
-//! The fast methods, of which `fast` picks one: `relief` is the surface that they see,
+//! The fast methods, of which `fast` picks one: `claims` is what they believe, `relief` is the surface that they see,
 //! `walk` their rays over it, many at a time in the `lanes` of the processor; `lod` casts a
 //! ray for each pixel, `column` along the lines of `lattice`. `frustum` and `voxel` stand
 //! alone. `progress` turns a region into pixels and `shade` what was seen into colours;
@@ -32,6 +32,7 @@
 
 mod beam;
 mod cell;
+mod claims;
 mod column;
 mod exact;
 mod fast;

@@ -4,6 +4,7 @@
 //! They use what the crate offers to others and nothing else. `TERRAFARM_LONG=1` casts
 //! twenty times as many rays.
 
+mod flight;
 mod fractions;
 mod horizons;
 mod moire;

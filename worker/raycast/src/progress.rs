@@ -37,7 +37,8 @@ pub struct Stats {
     pub steps: u64,
     /// Rays that met the ground.
     pub hits: u64,
-    /// Pixels that the method could not do its own way and gave a ray of their own.
+    /// Samples that the method could not do its own way and gave a ray of their own: a
+    /// property of the picture, however it was split and often it was tried.
     pub fallbacks: u64,
     /// The camera is at or below the surface.
     pub below_ground: bool,
@@ -119,7 +120,8 @@ impl Progress {
         missing.extend(wanted);
         self.stats.rays += seen.rays;
         self.stats.steps += seen.steps;
-        self.stats.fallbacks += seen.alone;
+        // Each go looks at the whole region: the last one counts.
+        self.stats.fallbacks = seen.alone;
         let hits = seen.inverse_depth.iter().filter(|&&inverse| inverse > 0.0).count();
         self.stats.hits += hits as u64;
         let mut shader = Shader::new(field, &view.camera, &view.shading, samples);

@@ -3,16 +3,20 @@
 //! Within a tile the maxima come with the tile; these begin where those end and let a
 //! ray pass over ground of which not a single tile is loaded.
 
+use crate::claims;
 use terrafarm_terrain::layout::{Layer, LayerKind, StoreIndex};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
-/// Maxima above the tiles, for every height layer of a store. Built once for a store.
+/// What rays need to know of a store's index: maxima above the tiles, for every height
+/// layer, and whether its deviations can be believed. Built once for a store.
 #[derive(Debug, Clone)]
 pub struct Pyramid {
     /// As the layers of the index; photo layers have no levels.
     layers: Vec<LayerMaxima>,
     lowest: f64,
     highest: f64,
+    /// Whether the deviations of the first height layer can be believed.
+    pub(crate) deviations_hold: bool,
 }
 
 /// Maxima above the tiles of one layer.
@@ -46,7 +50,9 @@ impl Pyramid {
         if lowest > highest {
             (lowest, highest) = (0.0, 0.0);
         }
-        Pyramid { layers, lowest, highest }
+        let first = index.layers_of(LayerKind::Height).next();
+        let deviations_hold = first.is_none_or(|(_, layer)| claims::hold(layer));
+        Pyramid { layers, lowest, highest, deviations_hold }
     }
 
     /// Lowest height of the terrain, metres.

@@ -40,7 +40,8 @@ pub struct Unfit {
 impl fmt::Display for Unfit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Unfit { method, why, instead } = self;
-        write!(f, "method {method} cannot do this: {why}; use {instead}, or auto")
+        write!(f, "method {method} cannot do this: {why}; use {instead}")?;
+        if *method == Method::Auto { Ok(()) } else { f.write_str(", or auto") }
     }
 }
 

@@ -175,6 +175,8 @@ pub struct RenderReport {
     pub rays: u64,
     /// Cells and blocks that they visited.
     pub steps: u64,
+    /// Samples that the method could not do its own way and gave a ray of their own.
+    pub fallbacks: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
 }

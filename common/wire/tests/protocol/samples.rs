@@ -37,7 +37,13 @@ pub fn shading() -> Shading {
 }
 
 fn report() -> RenderReport {
-    RenderReport { cost_us: 12_345, rays: 2_073_600, steps: 1 << 33, below_ground: true }
+    RenderReport {
+        cost_us: 12_345,
+        rays: 2_073_600,
+        steps: 1 << 33,
+        fallbacks: 64_282,
+        below_ground: true,
+    }
 }
 
 /// Errors of three pixels, two of which see other ground.
@@ -280,9 +286,9 @@ pub fn any_message() -> impl Strategy<Value = Message> {
         prop::collection::vec(any_hash(), 1..50).prop_map(|hashes| WantBlobs { hashes }.into());
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
-    let done = (any::<[u64; 4]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
-        .prop_map(|([lease, cost_us, rays, steps], below_ground, pixels, check)| {
-            let report = RenderReport { cost_us, rays, steps, below_ground };
+    let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
+        .prop_map(|([lease, cost_us, rays, steps, fallbacks], below_ground, pixels, check)| {
+            let report = RenderReport { cost_us, rays, steps, fallbacks, below_ground };
             Done { lease: LeaseId(lease), report, check, pixels }.into()
         });
     let failed = (any::<u64>(), ".{0,300}")

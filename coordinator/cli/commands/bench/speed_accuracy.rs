@@ -122,6 +122,8 @@ struct Point {
     error_px_max: f64,
     /// Root mean square, 8-bit levels.
     image_error: f64,
+    /// Share of the pixels that the method gave a ray of their own.
+    fallback_share: f64,
     /// Another point is better by time and screen error.
     dominated_px: bool,
     /// Another point is better by time and image error.
@@ -229,6 +231,7 @@ fn bench_camera(
                     error_px_p99: p99,
                     error_px_max: max,
                     image_error: measured.image,
+                    fallback_share: measured.fallbacks,
                     dominated_px: false,
                     dominated_image: false,
                     dominated: false,
@@ -278,6 +281,8 @@ struct Measured {
     seconds: f64,
     screen: Spread,
     image: f64,
+    /// Share of the pixels.
+    fallbacks: f64,
 }
 
 fn measure(
@@ -292,9 +297,10 @@ fn measure(
     // No ray of the reference helps another: patches tell what the picture costs.
     let is_slow = view.quality.method == Method::Reference;
     let timed = if is_slow { patches } else { &whole };
-    let mut errors = Vec::new();
+    let (mut errors, mut fallbacks) = (Vec::new(), 0);
     for &region in timed {
         let answer = kernel::answer_in(land, view, region)?;
+        fallbacks += answer.stats.fallbacks;
         errors.extend(kernel::errors(land, view, region, &answer)?.error_px);
     }
     let mut times = Vec::new();
@@ -311,6 +317,7 @@ fn measure(
         seconds: median(&mut times) * frame.area() as f64 / area.max(1) as f64,
         screen: Spread::of(errors),
         image: (squares / shown.len().max(1) as f64).sqrt(),
+        fallbacks: fallbacks as f64 / area.max(1) as f64,
     })
 }
 
@@ -368,6 +375,7 @@ fn means(report: &Report) -> Vec<Point> {
             error_px_p99: worst(|point| point.error_px_p99),
             error_px_max: worst(|point| point.error_px_max),
             image_error: mean(|point| point.image_error),
+            fallback_share: mean(|point| point.fallback_share),
             kept: points.iter().all(|point| point.kept),
             ..(*first).clone()
         });
@@ -428,7 +436,8 @@ fn panels(means: &[Point]) -> [chart::Panel; 2] {
 }
 
 fn text(report: &Report, means: &[Point]) -> String {
-    let head = ["method", "setting", "ms/frame", "p99 px", "max px", "RMS levels", ""];
+    let head =
+        ["method", "setting", "ms/frame", "p99 px", "max px", "RMS levels", "fallbacks %", ""];
     let rows: Vec<Vec<String>> = means
         .iter()
         .map(|point| {
@@ -439,6 +448,7 @@ fn text(report: &Report, means: &[Point]) -> String {
                 digits(point.error_px_p99),
                 digits(point.error_px_max),
                 digits(point.image_error),
+                digits(100.0 * point.fallback_share),
                 match (point.dominated_px, point.dominated_image) {
                     (false, false) => "best by both errors".into(),
                     (false, true) => "best by screen error".into(),

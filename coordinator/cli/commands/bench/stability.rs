@@ -11,6 +11,7 @@
 //! `exact`. Flights, hillshades and missing tiles have scenes of their own (`systems`).
 
 mod judge;
+mod popping;
 mod scenes;
 mod systems;
 
@@ -33,13 +34,15 @@ struct Cell {
     scene: String,
     /// A method, or the part of the program that the scene is about.
     method: String,
-    /// `in-bound`, `refused` or `silent`.
+    /// `in-bound`, `refused`, `outside` or `silent`.
     outcome: &'static str,
     value: Option<f64>,
     bound: f64,
     unit: &'static str,
     /// Why it was refused.
     why: Option<String>,
+    /// What else was measured.
+    note: Option<String>,
 }
 
 impl Cell {
@@ -54,7 +57,20 @@ impl Cell {
             bound,
             unit,
             why: None,
+            note: None,
         }
+    }
+
+    /// A cell with a number that is no error of a picture but a claim about films.
+    fn claimed(scene: &str, method: &str, value: f64, bound: f64, unit: &'static str) -> Self {
+        let measured = Cell::measured(scene, method, value, bound, unit);
+        let outcome = if measured.outcome == "silent" { "outside" } else { measured.outcome };
+        Cell { outcome, ..measured }
+    }
+
+    /// Says what else was measured.
+    fn with_note(self, note: String) -> Self {
+        Cell { note: Some(note), ..self }
     }
 
     /// A cell without one: the method said why.
@@ -72,6 +88,7 @@ pub fn run(args: &args::BenchStability) -> anyhow::Result<Outcome> {
         short: args.short,
         cells: systems::cells()?,
     };
+    report.cells.extend(popping::cells(size, args.short)?);
     for scene in scenes::all(size)? {
         for method in Method::ALL {
             let tolerance_px = Quality::DEFAULT_TOLERANCE_PX;
@@ -91,6 +108,16 @@ pub fn run(args: &args::BenchStability) -> anyhow::Result<Outcome> {
     Ok(if silent == 0 { Outcome::Done } else { Outcome::BrokenPromise })
 }
 
+/// The outcome of a cell in words.
+fn said(cell: &Cell) -> String {
+    let outcome = match cell.outcome {
+        "silent" => "SILENT",
+        outcome => outcome,
+    };
+    let more = cell.why.iter().chain(&cell.note).map(|text| format!(": {text}"));
+    outcome.to_owned() + &more.collect::<String>()
+}
+
 fn text(report: &Report) -> String {
     let head = ["scene", "method", "value", "bound", "unit", "outcome"];
     let rows: Vec<Vec<String>> = report
@@ -103,11 +130,7 @@ fn text(report: &Report) -> String {
                 cell.value.map_or_else(|| "-".to_owned(), digits),
                 digits(cell.bound),
                 cell.unit.to_owned(),
-                match &cell.why {
-                    Some(why) => format!("refused: {why}"),
-                    None if cell.outcome == "silent" => "SILENT".to_owned(),
-                    None => cell.outcome.to_owned(),
-                },
+                said(cell),
             ]
         })
         .collect();

@@ -5,7 +5,9 @@ use crate::oracle::{Dice, Land, bare, count, lands};
 use crate::tests_support::{Plan, mountains, store};
 use crate::{Pyramid, Unseen, depths};
 use glam::DVec3;
+use std::sync::Arc;
 use terrafarm_common::shading::Earth;
+use terrafarm_terrain::resident::Resident;
 
 const SIZE: (u32, u32) = (80, 60);
 const METHODS: [Method; 2] = [Method::Lod, Method::Column];
@@ -99,15 +101,19 @@ fn strips_and_tiles_make_the_same_picture_as_the_whole() {
         let whole = Region::whole(320, 180);
         for method in METHODS {
             let see = |region| {
-                see(field, &view, region, method, lanes::widest()).unwrap().0.inverse_depth
+                let (seen, _) = see(field, &view, region, method, lanes::widest()).unwrap();
+                (seen.inverse_depth, seen.alone)
             };
-            let truth = see(whole);
+            let (truth, alone) = see(whole);
+            let mut alone_in_parts = 0;
             let (width, height) = [(32, 180), (7, 180), (24, 24), (64, 64)][(round % 4) as usize];
             for y in (0..180).step_by(height as usize) {
                 for x in (0..320).step_by(width as usize) {
                     let (width, height) = (width.min(320 - x), height.min(180 - y));
                     let part = Region { x, y, width, height };
-                    for ([x, y], inverse) in part.pixels().zip(see(part)) {
+                    let (seen, alone) = see(part);
+                    alone_in_parts += alone;
+                    for ([x, y], inverse) in part.pixels().zip(seen) {
                         let truth = truth[(y * 320 + x) as usize];
                         let said =
                             format!("{method:?} {view:?} {part:?} {x} {y} {inverse} {truth}");
@@ -115,6 +121,8 @@ fn strips_and_tiles_make_the_same_picture_as_the_whole() {
                     }
                 }
             }
+            assert_eq!(alone_in_parts, alone, "{method:?} {view:?}");
+            assert!(alone == 0 || method == Method::Column);
         }
     }
 }
@@ -221,5 +229,66 @@ fn insets_and_single_rows_are_refused_by_name_and_left_to_exact_by_auto() {
     ] {
         view.quality.tolerance_px = tolerance_px;
         assert_eq!(Look::of(field, &view), Ok(look));
+    }
+}
+
+/// Hills whose coarser levels say something else of their deviation.
+fn claiming(deviation: f32) -> Land {
+    let mut land = hills();
+    let mut index = StoreIndex::clone(land.resident.index());
+    for entry in index.layers[0].levels[1..].iter_mut().flat_map(|level| &mut level.entries) {
+        entry.deviation = deviation;
+    }
+    index.check().unwrap();
+    let mut resident = Resident::new(Arc::new(index));
+    let height = |i, j| mountains(i, j, 512, 300.0, 21) * 0.6;
+    let (_, tiles) = store(vec![Plan::heights([1000.0, -500.0], [9.0, 10.0], [1100, 900], height)]);
+    for (key, tile) in tiles {
+        assert!(resident.insert(key, tile));
+    }
+    land.pyramid = Pyramid::new(resident.index());
+    land.resident = resident;
+    land
+}
+
+#[test]
+fn a_store_without_deviations_is_refused_and_the_refusal_says_how_to_make_it_again() {
+    let land = claiming(0.0);
+    let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+    let camera = Camera::from_angles(DVec3::splat(900.0), 0.0, -40.0, 0.0, 60.0, SIZE);
+    for method in [quality::Method::Lod, quality::Method::Column, quality::Method::Auto] {
+        let mut view = view(camera, &mut Dice::new(1), method);
+        view.quality.tolerance_px = 0.5;
+        let refused = depths(&land.resident, &land.pyramid, &view, Region::whole(80, 60));
+        let Err(Unseen::Unfit(refused)) = refused else { panic!("{method} was not refused") };
+        assert_eq!((refused.method, refused.instead), (method, quality::Method::Exact));
+        let said = refused.to_string();
+        assert!(said.contains("terrafarm terrain import"), "{said}");
+        assert_eq!(said.ends_with("use exact"), method == quality::Method::Auto, "{said}");
+        // What asks for no level of detail does not need the deviations.
+        view.quality =
+            Quality { tolerance_px: 0.01, method: quality::Method::Auto, ..view.quality };
+        assert_eq!(Look::of(field, &view), Ok(Look::RayByRay(quality::Method::Exact)));
+        view.quality.method = quality::Method::Frustum;
+        assert_eq!(Look::of(field, &view), Ok(Look::Fast(Method::Frustum)));
+    }
+}
+
+#[test]
+fn levels_that_cannot_be_compared_are_not_used_and_the_finest_is() {
+    let land = claiming(f32::INFINITY);
+    let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+    let eye = DVec3::new(2000.0, 300.0, land.pyramid.highest() + 300.0);
+    let camera = Camera::from_angles(eye, 20.0, -25.0, 0.0, 60.0, SIZE);
+    for method in METHODS {
+        let mut view = view(camera, &mut Dice::new(2), quality::Method::Lod);
+        view.quality.tolerance_px = 8.0;
+        let (seen, missing) = see(field, &view, Region::whole(80, 60), method, Width::One).unwrap();
+        assert_eq!(missing, []);
+        let relief = Relief::new(field, &view, 8.0);
+        let levels: Vec<u32> =
+            (0..relief.plots[0] * relief.plots[1]).map(|plot| relief.plot(plot).level).collect();
+        assert!(levels.iter().all(|level| *level == 0), "{levels:?}");
+        assert!(seen.inverse_depth.iter().any(|inverse| *inverse > 0.0), "{method:?}");
     }
 }
