@@ -64,7 +64,7 @@ pub use progress::{Progress, Rendered, Stats};
 pub use pyramid::Pyramid;
 pub use seen::Unfit;
 pub use shade::shade;
-pub use sight::{Depths, Hit, Missing, Unseen, cast, depths, trace};
+pub use sight::{AtHand, Depths, Hit, Missing, Unseen, cast, depths, depths_at_hand, trace};
 
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
