@@ -26,7 +26,7 @@ use std::path::Path;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::shading::{Shading, Sky, Sun};
-use terrafarm_raycast::View;
+use terrafarm_raycast::{Depths, View};
 
 /// The methods whose cost is to follow the picture and not the terrain.
 const METHODS: [Method; 2] = [Method::Lod, Method::Column];
@@ -212,9 +212,6 @@ fn fly(
     let peak = ProcessPeak::begin();
     let mut cache = Cache::new(&made.store, limit_bytes);
     let mut first = None;
-    let pixels = views
-        .first()
-        .map_or(1.0, |view| f64::from(view.camera.width) * f64::from(view.camera.height));
     for view in views {
         cache.begin();
         cache.picture(view)?;
@@ -222,7 +219,16 @@ fn fly(
         first.get_or_insert((view, depths));
     }
     let (view, depths) = first.context("the flight has no frame")?;
-    let mut case = Case {
+    let pixels = depths.region.area() as f64;
+    let peak_process_bytes = peak.bytes();
+    let shown: Vec<f64> = depths
+        .region
+        .pixels()
+        .map(|[x, y]| depths.distance_m(view, x, y))
+        .filter(|distance| distance.is_finite())
+        .collect();
+    let spread = check(made, view, &depths, limit_bytes)?;
+    Ok(Case {
         posts: made.posts,
         camera,
         method: view.quality.method.name(),
@@ -230,38 +236,35 @@ fn fly(
         loads: cache.loads,
         load_s: cache.load_s,
         peak_cache_bytes: cache.peak_bytes,
-        peak_process_bytes: peak.bytes(),
+        peak_process_bytes,
         rays_ms: 0.0,
         picture_ms: 0.0,
         ratio_rays: 0.0,
         ratio_picture: 0.0,
         steps_per_pixel: depths.stats.steps as f64 / pixels,
-        ground: 0.0,
-        farthest_m: 0.0,
-        error_px_p99: 0.0,
-        error_px_max: 0.0,
-        right: false,
+        ground: shown.len() as f64 / pixels,
+        farthest_m: shown.into_iter().fold(0.0, f64::max),
+        error_px_p99: spread.p99,
+        error_px_max: spread.max,
+        right: Promise::of(view.quality.method, TOLERANCE_PX).holds(&spread),
         times: Default::default(),
-    };
-    // What only `exact` needs is no part of the method's memory.
+    })
+}
+
+/// Compares a net of pixels with `exact`, in a cache of its own: what only `exact` needs is
+/// no part of the method's memory.
+fn check(made: &Made, view: &View, depths: &Depths, limit_bytes: u64) -> anyhow::Result<Spread> {
     let mut cache = Cache::new(&made.store, limit_bytes);
     let mut errors = Vec::new();
-    for (&inverse, [x, y]) in depths.inverse_depth.iter().zip(depths.region.pixels()) {
-        if inverse > 0.0 {
-            case.ground += 1.0 / pixels;
-            case.farthest_m = case.farthest_m.max(depths.distance_m(view, x, y));
-        }
-        let [columns, rows] = CHECKED;
-        let nets = [view.camera.width / columns, view.camera.height / rows].map(|n| n.max(1));
-        if x % nets[0] == nets[0] / 2 && y % nets[1] == nets[1] / 2 {
+    let step = [(view.camera.width, CHECKED[0]), (view.camera.height, CHECKED[1])]
+        .map(|(side, count)| (side / count).max(1));
+    for y in (step[1] / 2..view.camera.height).step_by(step[1] as usize) {
+        for x in (step[0] / 2..view.camera.width).step_by(step[0] as usize) {
             cache.begin();
             errors.push(cache.error_px(view, [x, y], depths.distance_m(view, x, y))?);
         }
     }
-    let spread = Spread::of(errors);
-    case.right = Promise::of(view.quality.method, TOLERANCE_PX).holds(&spread);
-    (case.error_px_p99, case.error_px_max) = (spread.p99, spread.max);
-    Ok(case)
+    Ok(Spread::of(errors))
 }
 
 /// Times every frame over all terrains in turn, its tiles in memory.

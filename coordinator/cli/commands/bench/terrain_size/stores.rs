@@ -6,7 +6,7 @@
 use crate::commands::bench::land::{height_layer, noise};
 use crate::progress;
 use anyhow::{Context, bail};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
@@ -18,7 +18,7 @@ pub const SPACING_M: f64 = 10.0;
 /// The post of the noise, along x and y, that is in the middle of every terrain.
 const MIDDLE: u64 = 1 << 20;
 /// What a post takes on disk, all levels, bytes: measured, and a tenth more.
-const BYTES_PER_POST: f64 = 1.6;
+const BYTES_PER_POST: f64 = 1.2;
 
 /// A square of the noise.
 struct Window {
@@ -134,7 +134,7 @@ fn free_bytes(_folder: &Path) -> Option<f64> {
 }
 
 /// Writes a terrain, in parallel and a strip at a time. Returns the seconds it took.
-fn make(path: &PathBuf, posts: u32) -> anyhow::Result<f64> {
+fn make(path: &Path, posts: u32) -> anyhow::Result<f64> {
     let began = Instant::now();
     let half = u64::from(posts / 2);
     let spec = LayerSpec {
