@@ -48,7 +48,7 @@ const STEP_M: f64 = 60.0;
 /// Pixels along the sides of the picture that are compared with `exact`.
 const CHECKED: [u32; 2] = [24, 14];
 /// The short form.
-const SHORT_POSTS: [u32; 3] = [257, 513, 1025];
+const SHORT_POSTS: [u32; 3] = [513, 1025, 2049];
 const SHORT_SIZE: (u32, u32) = (160, 90);
 
 /// What is written as JSON. Keys are promises.
