@@ -3,10 +3,9 @@ use super::*;
 use crate::meter::measure;
 use crate::oracle::{Dice, Land, bare, count, lands};
 use crate::tests_support::{Plan, mountains, store};
-use crate::{Pyramid, Unseen, cast, depths, depths_at_hand};
+use crate::{Pyramid, Unseen, depths};
 use glam::DVec3;
 use terrafarm_common::shading::Earth;
-use terrafarm_terrain::resident::{Resident, Tile};
 
 const SIZE: (u32, u32) = (80, 60);
 const METHODS: [Method; 2] = [Method::Lod, Method::Column];
@@ -153,13 +152,9 @@ fn what_is_seen_is_on_the_surface_to_the_tolerance() {
 /// Whether the exact ray meets a wall: the rim of a void or of the land, which is no
 /// height above any place.
 fn on_a_wall(land: &Land, view: &View, x: u32, y: u32) -> bool {
-    on_a_wall_of(&land.resident, &land.pyramid, view, x, y)
-}
-
-fn on_a_wall_of(resident: &Resident, pyramid: &Pyramid, view: &View, x: u32, y: u32) -> bool {
     let quality = Quality { method: quality::Method::Exact, ..view.quality };
     let exact = View { quality, ..view.clone() };
-    let hit = cast(resident, pyramid, &exact, f64::from(x) + 0.5, f64::from(y) + 0.5).unwrap();
+    let hit = land.look(&exact, [f64::from(x) + 0.5, f64::from(y) + 0.5]);
     hit.is_some_and(|hit| hit.height > hit.position.z + 1e-6)
 }
 
@@ -196,121 +191,6 @@ fn missing_tiles_are_named_until_the_picture_is_whole() {
         };
         assert_eq!(bits(&seen.inverse_depth), bits(&truth.inverse_depth), "{method}");
         assert!(rounds > 0 && resident.loaded().count() < tiles.len());
-    }
-}
-
-/// A land of hills without its tiles, these, and its maxima.
-fn unloaded() -> (Resident, Vec<(TileKey, Tile)>, Pyramid) {
-    let height = |i, j| mountains(i, j, 512, 300.0, 21) * 0.6;
-    let (empty, tiles) = store(vec![Plan::heights([0.0; 2], [10.0; 2], [1100, 900], height)]);
-    let pyramid = Pyramid::new(empty.index());
-    (empty, tiles, pyramid)
-}
-
-/// A view over it, at half a pixel.
-fn view_over(pyramid: &Pyramid, method: quality::Method) -> View {
-    let eye = DVec3::new(2000.0, 300.0, pyramid.highest() + 100.0);
-    let camera = Camera::from_angles(eye, 20.0, -15.0, 0.0, 60.0, SIZE);
-    let quality = Quality { method, tolerance_px: 0.5, ..Quality::default() };
-    View { camera, shading: bare(None), quality }
-}
-
-#[test]
-fn a_picture_that_cannot_wait_has_no_holes_and_tells_what_is_coarser() {
-    let (empty, tiles, pyramid) = unloaded();
-    let roots = empty.index().roots();
-    let whole = Region::whole(SIZE.0, SIZE.1);
-    for method in [quality::Method::Lod, quality::Method::Column] {
-        let view = view_over(&pyramid, method);
-        let mut resident = empty.clone();
-        let nothing = depths_at_hand(&resident, &pyramid, &view, whole);
-        assert!(matches!(nothing, Err(Unseen::Missing(keys)) if !keys.is_empty()), "{method}");
-        for (key, tile) in &tiles {
-            resident.insert(*key, tile.clone());
-        }
-        let truth = depths(&resident, &pyramid, &view, whole).unwrap();
-        let full = depths_at_hand(&resident, &pyramid, &view, whole).unwrap();
-        assert!(!full.is_degraded() && full.coarser == 0, "{method}");
-        assert_eq!(bits(&full.depths.inverse_depth), bits(&truth.inverse_depth), "{method}");
-        assert_eq!(full.depths, truth);
-
-        let mut dice = Dice::new(77);
-        let mut degraded = 0;
-        for round in 0..count(30) {
-            let mut some = resident.clone();
-            let share = round as f64 / count(30) as f64;
-            for (key, _) in tiles.iter().filter(|(key, _)| !roots.contains(key)) {
-                if dice.between(0.0, 1.0) < share {
-                    some.remove(*key);
-                }
-            }
-            let seen = depths_at_hand(&some, &pyramid, &view, whole).unwrap();
-            let said = format!("{method}, {share} of the tiles are missing");
-            assert!(seen.depths.inverse_depth.iter().all(|inverse| *inverse >= 0.0), "{said}");
-            match depths(&some, &pyramid, &view, whole) {
-                Ok(waited) => {
-                    assert!(!seen.is_degraded() && seen.coarser == 0, "{said}");
-                    assert_eq!(seen.depths, waited, "{said}");
-                }
-                Err(Unseen::Missing(_)) => {
-                    degraded += 1;
-                    assert!(seen.is_degraded(), "{said}");
-                    let differing = bits(&seen.depths.inverse_depth)
-                        .iter()
-                        .zip(bits(&truth.inverse_depth))
-                        .filter(|(a, b)| *a != b)
-                        .count();
-                    assert!(differing == 0 || seen.coarser > 0, "{said}: {differing} pixels");
-                }
-                Err(Unseen::Unfit(unfit)) => panic!("{unfit}"),
-            }
-        }
-        assert!(degraded > count(30) / 2, "{method}: {degraded}");
-    }
-}
-
-#[test]
-fn the_error_grows_with_the_levels_that_are_missing_and_stays_within_theirs() {
-    let (empty, tiles, pyramid) = unloaded();
-    let whole = Region::whole(SIZE.0, SIZE.1);
-    let mut resident = empty.clone();
-    for (key, tile) in &tiles {
-        resident.insert(*key, tile.clone());
-    }
-    let layer = &empty.index().layers[0];
-    for method in [quality::Method::Lod, quality::Method::Column] {
-        let view = view_over(&pyramid, method);
-        let mut some = resident.clone();
-        let (mut coarser, mut means) = (0, Vec::new());
-        for level in 0..=layer.root_level() {
-            let seen = depths_at_hand(&some, &pyramid, &view, whole).unwrap();
-            assert!(seen.coarser >= coarser, "{method}: fewer pixels are coarser than before");
-            coarser = seen.coarser;
-            let entries = layer.levels[..=level].iter().flat_map(|level| &level.entries);
-            let deviation = entries.map(|entry| f64::from(entry.deviation)).fold(0.0, f64::max);
-            let mut sum = 0.0;
-            let mut pixels = 0;
-            for [x, y] in whole.pixels().step_by(7) {
-                let claimed = seen.depths.distance_m(&view, x, y);
-                if claimed.is_infinite() || on_a_wall_of(&resident, &pyramid, &view, x, y) {
-                    continue;
-                }
-                let error = measure(&resident, &pyramid, &view, x, y, claimed).unwrap();
-                // The level's own deviation where that is more than was asked for.
-                let most = deviation / claimed * view.camera.focal_px();
-                let allowed = most.max(view.quality.tolerance_px) + 0.02;
-                let said = format!("{method}, level {level}, {x} {y}: {error:?}, {allowed}");
-                assert!(error.surface_px <= allowed, "{said}");
-                sum += error.surface_px;
-                pixels += 1;
-            }
-            assert!(pixels > 100, "{method} {level}: {pixels}");
-            means.push(sum / f64::from(pixels));
-            for (key, _) in tiles.iter().filter(|(key, _)| usize::from(key.level) == level) {
-                some.remove(*key);
-            }
-        }
-        assert!(coarser > 0 && means.is_sorted(), "{method}: {means:?}");
     }
 }
 
