@@ -367,6 +367,8 @@ pub enum Bench {
     Core(BenchCore),
     /// Time against error: all methods and settings over procedural and real terrain
     SpeedAccuracy(BenchSpeedAccuracy),
+    /// Cost of a frame, and of its terrain in memory, over ever larger terrain on disk
+    TerrainSize(BenchTerrainSize),
     /// Situations in which methods are known to fail, by every method that may be asked
     Stability(BenchStability),
 }
@@ -424,6 +426,34 @@ pub struct BenchSpeedAccuracy {
     /// Write the chart as PNG
     #[arg(long, value_name = "FILE")]
     pub png: Option<PathBuf>,
+}
+
+/// `terrafarm bench terrain-size`
+#[derive(Debug, ClapArgs)]
+pub struct BenchTerrainSize {
+    /// Small terrains and pictures, for a quick look
+    #[arg(long, conflicts_with_all = ["posts", "size"])]
+    pub short: bool,
+    /// Posts along a side of the terrains, with commas
+    #[arg(long, value_delimiter = ',', default_value = "1025,2049,4097,8193,16385,32769",
+        value_parser = clap::value_parser!(u32).range(65..=65_537))]
+    pub posts: Vec<u32>,
+    /// Size of the picture
+    #[arg(long, value_parser = parse_size, value_name = "WxH", default_value = "1280x720")]
+    pub size: (u32, u32),
+    /// Memory for decoded terrain, MiB
+    #[arg(long, value_name = "MIB", default_value_t = 1024,
+        value_parser = clap::value_parser!(u64).range(1..=1 << 20))]
+    pub cache: u64,
+    /// Folder that keeps the terrains, and where they are looked for [default: a temporary one]
+    #[arg(long, value_name = "FOLDER")]
+    pub stores: Option<PathBuf>,
+    /// Timed runs of each frame, of which the median counts
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
 }
 
 /// `terrafarm bench stability`

@@ -80,6 +80,38 @@ fn the_chart_of_speed_and_accuracy_has_every_method_and_both_forms() {
 }
 
 #[test]
+fn larger_terrain_is_flown_through_a_cache_of_a_few_tiles_and_its_stores_are_kept() {
+    let dir = Dir::new();
+    let (report, stores) = (dir.path("size.json"), dir.path("stores"));
+    let fly = |cache: &str| {
+        let mut command = terrafarm();
+        command.args(["bench", "terrain-size", "--short", "--repeats", "1", "--cache", cache]);
+        command.arg("--stores").arg(&stores).arg("--json").arg(&report);
+        command
+    };
+    let text = succeed(&mut fly("64"));
+    assert!(text.contains("largest ratio"), "{text}");
+    let first = json(&report);
+    let cases = first["cases"].as_array().unwrap();
+    assert_eq!(cases.len(), 3 * 2 * 2);
+    for case in cases {
+        assert_eq!(case["right"], true, "{case}");
+        assert!(case["peak_cache_bytes"].as_u64().unwrap() <= 64 << 20, "{case}");
+        for key in ["rays_ms", "picture_ms", "ratio_rays", "load_s", "tiles", "ground"] {
+            assert!(case[key].as_f64().unwrap() > 0.0, "{key} in {case}");
+        }
+    }
+    let built = |report: &Value| {
+        report["stores"].as_array().unwrap().iter().filter(|s| s["built_s"].is_f64()).count()
+    };
+    assert_eq!(built(&first), 3);
+    succeed(&mut fly("64"));
+    assert_eq!(built(&json(&report)), 0);
+    let (_, refused) = run(&mut fly("1"), 2);
+    assert!(refused.contains("limit is 1 MB"), "{refused}");
+}
+
+#[test]
 fn no_method_is_silently_wrong_in_any_scene_of_the_stability_suite() {
     let dir = Dir::new();
     let report = dir.path("stability.json");

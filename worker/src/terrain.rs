@@ -4,6 +4,10 @@
 //! limit is exceeded; the ray caster leaves no trace of what it looks at, and a tile that
 //! was wrongly forgotten comes back from the cache on disk in about a millisecond. Tiles
 //! that the present job has asked for stay until it ends: so a job always gets further.
+//!
+//! The roots of a store, a tile or a few for each layer, are loaded with the first tiles
+//! that a job asks for and stay as long as the store does: whoever cannot wait for a tile
+//! finds some ground there (`terrafarm_raycast::depths_at_hand`).
 
 use crate::render::Scene;
 use std::collections::{BTreeMap, VecDeque};
@@ -11,9 +15,13 @@ use std::sync::Arc;
 use terrafarm_common::id::BlobHash;
 use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::{Resident, Tile};
+use terrafarm_terrain::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
 
 /// Most stores whose index stays in memory although no shot uses it.
 const IDLE_STORES_MAX: usize = 4;
+
+/// Part of the limit that the roots of a store may take: more are ordinary tiles.
+const ROOTS_PART: u64 = 8;
 
 /// All terrain in memory. `P` is what the ray caster works out for each store.
 pub struct Terrain<P> {
@@ -33,6 +41,10 @@ pub struct Terrain<P> {
 struct Store<P> {
     resident: Arc<Resident>,
     prepared: Arc<P>,
+    /// Tiles that stay as long as the store does, sorted ...
+    roots: Vec<TileKey>,
+    /// ... and the bytes of those that are loaded.
+    root_bytes: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,8 +86,13 @@ impl<P> Terrain<P> {
 
     /// Takes a store whose index has passed its check.
     pub fn add_store(&mut self, store: BlobHash, resident: Resident, prepared: P) {
-        let entry = Store { resident: Arc::new(resident), prepared: Arc::new(prepared) };
-        self.stores.insert(store, entry);
+        let mut roots = resident.index().roots();
+        let most = HEIGHT_TILE_BYTES.max(PHOTO_TILE_BYTES) as u64;
+        if roots.len() as u64 > self.limit_bytes / ROOTS_PART / most {
+            roots.clear();
+        }
+        let (resident, prepared) = (Arc::new(resident), Arc::new(prepared));
+        self.stores.insert(store, Store { resident, prepared, roots, root_bytes: 0 });
     }
 
     /// No shot uses a store any more: keeps it for a while, for the next shot.
@@ -87,7 +104,8 @@ impl<P> Terrain<P> {
         if self.idle.len() > IDLE_STORES_MAX
             && let Some(oldest) = self.idle.pop_front()
         {
-            self.stores.remove(&oldest);
+            let roots = self.stores.remove(&oldest).map_or(0, |store| store.root_bytes);
+            self.bytes -= roots;
             let gone = |loaded: &Loaded| loaded.place.store == oldest;
             self.bytes -= self.loaded.iter().filter(|l| gone(l)).map(|l| l.bytes).sum::<u64>();
             self.loaded.retain(|loaded| !gone(loaded));
@@ -108,11 +126,14 @@ impl<P> Terrain<P> {
         Some(Scene { resident: store.resident.clone(), prepared: store.prepared.clone() })
     }
 
-    /// Notes that a job waits for tiles; their hashes, each once.
+    /// Notes that a job waits for tiles; their hashes, each once. Roots of the store that are
+    /// not in memory are among them.
     pub fn await_tiles(&mut self, store: BlobHash, keys: &[TileKey]) -> Vec<BlobHash> {
         let Some(known) = self.stores.get(&store) else { return Vec::new() };
         let mut hashes = Vec::new();
-        for &key in keys {
+        let absent = |key: &TileKey| !known.resident.is_loaded(*key);
+        let roots = known.roots.iter().copied().filter(absent);
+        for key in roots.chain(keys.iter().copied()) {
             let Some(entry) = known.resident.index().entry(key) else { continue };
             let places = self.awaited.entry(entry.hash).or_default();
             let place = Place { store, key };
@@ -136,10 +157,15 @@ impl<P> Terrain<P> {
             if !Arc::make_mut(&mut store.resident).insert(place.key, tile.clone()) {
                 return Err(format!("it is no tile for {:?}", place.key));
             }
-            self.loaded.push_back(Loaded { place, bytes });
-            self.pinned += 1;
             // The places share one tile.
-            self.bytes += std::mem::take(&mut bytes);
+            let bytes = std::mem::take(&mut bytes);
+            self.bytes += bytes;
+            if store.roots.binary_search(&place.key).is_ok() {
+                store.root_bytes += bytes;
+            } else {
+                self.loaded.push_back(Loaded { place, bytes });
+                self.pinned += 1;
+            }
         }
         self.trim();
         Ok(())
@@ -273,6 +299,33 @@ mod tests {
         terrain.add_tile(BlobHash([10; 32]), &tile()).expect("it belongs there");
         assert_eq!(in_memory(&terrain), [0, 5]);
         assert_eq!(terrain.bytes(), tile().memory_bytes() as u64);
+    }
+
+    #[test]
+    fn the_root_is_loaded_with_the_first_tile_and_stays() {
+        let least = ROOTS_PART as usize * HEIGHT_TILE_BYTES.max(PHOTO_TILE_BYTES);
+        let mut terrain: Terrain<()> = Terrain::new(least as u64);
+        terrain.add_store(STORE, resident(), ());
+        let root = TileKey { layer: 0, level: 3, tx: 0, ty: 0 };
+        let is_there = |terrain: &Terrain<()>| {
+            let scene = terrain.scene(STORE).expect("the store is there");
+            matches!(scene.resident.height(root), Lookup::Found(_))
+        };
+        load(&mut terrain, &[key(1)]);
+        assert!(is_there(&terrain));
+        assert_eq!(terrain.bytes(), 2 * tile().memory_bytes() as u64);
+        assert_eq!(terrain.await_tiles(STORE, &[key(2)]).len(), 1, "it is not asked for again");
+        terrain.limit_bytes = 1;
+        terrain.begin_job();
+        assert!(in_memory(&terrain).is_empty() && is_there(&terrain));
+        assert_eq!(terrain.bytes(), tile().memory_bytes() as u64);
+        terrain.release(STORE);
+        for number in 0..IDLE_STORES_MAX {
+            let other = BlobHash([100 + number as u8; 32]);
+            terrain.add_store(other, resident(), ());
+            terrain.release(other);
+        }
+        assert_eq!(terrain.bytes(), 0);
     }
 
     #[test]

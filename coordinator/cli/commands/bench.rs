@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | `bench core` | how fast is each method on one core? | `core` |
 //! | `bench speed-accuracy` | what does a smaller error cost? | `speed_accuracy`, `chart` |
+//! | `bench terrain-size` | what does a frame cost over ever larger terrain? | `terrain_size` |
 //! | `bench stability` | is any method silently wrong where it is known to be hard? | `stability` |
 //!
 //! Nothing is timed or charted without being checked, and a method that breaks its
@@ -18,6 +19,7 @@ mod land;
 mod report;
 mod speed_accuracy;
 mod stability;
+mod terrain_size;
 
 use crate::Outcome;
 use crate::args;
@@ -27,6 +29,7 @@ pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
     match args {
         args::Bench::Core(args) => core::run(args),
         args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
+        args::Bench::TerrainSize(args) => terrain_size::run(args),
         args::Bench::Stability(args) => stability::run(args),
     }
 }

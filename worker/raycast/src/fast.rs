@@ -6,7 +6,7 @@ use crate::field::Field;
 use crate::frustum;
 use crate::lanes::{self, Width};
 use crate::lod::Lod;
-use crate::relief::Relief;
+use crate::relief::{Lack, Relief};
 use crate::seen::{Seen, Unfit};
 use crate::voxel;
 use terrafarm_common::camera::Camera;
@@ -98,6 +98,19 @@ pub(crate) fn see(
     method: Method,
     width: Width,
 ) -> Result<(Seen, Vec<TileKey>), Unfit> {
+    see_with(field, view, region, method, width, Lack::Open)
+}
+
+/// The same, with a choice of what `lod` and `column` make of places without a tile. Of the
+/// other methods they are open in any case.
+pub(crate) fn see_with(
+    field: Field,
+    view: &View,
+    region: Region,
+    method: Method,
+    width: Width,
+    lack: Lack,
+) -> Result<(Seen, Vec<TileKey>), Unfit> {
     match method {
         Method::Frustum => return frustum::see(field, view, region),
         Method::Voxel => return voxel::see(field, view, region),
@@ -105,14 +118,15 @@ pub(crate) fn see(
     }
     let tolerance_px = view.quality.tolerance_px;
     let share = if method == Method::Column { column::LEVELS } else { 1.0 };
-    let relief = Relief::new(field, view, share * tolerance_px);
+    let relief = Relief::new(field, view, share * tolerance_px, lack);
     let (relief, camera) = (&relief, &view.camera);
-    let seen = if method == Method::Column {
+    let mut seen = if method == Method::Column {
         lanes::run(Columns { relief, camera, tolerance_px, region }, width)
     } else {
         let slack = relief.tolerance;
         lanes::run(Lod { field, relief, view, region, slack }, width)
     };
+    seen.coarser = relief.coarser_pixels(camera, region, &seen.inverse_depth);
     Ok((seen, relief.wanted()))
 }
 

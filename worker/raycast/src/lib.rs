@@ -24,12 +24,13 @@
 //! `walk` their rays over it, many at a time in the `lanes` of the processor; `lod` casts a
 //! ray for each pixel, `column` along the lines of `lattice`. `frustum` and `voxel` stand
 //! alone. `progress` turns a region into pixels and `shade` what was seen into colours;
-//! `sight` answers without colours, and [`meter`] measures how far an answer is from that
+//! `sight` answers without colours, `at_hand` without waiting for tiles, and [`meter`] measures how far an answer is from that
 //! of `exact`.
 //!
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
 //! multiplication is used in anything that ends in a pixel.
 
+mod at_hand;
 mod beam;
 mod cell;
 mod claims;
@@ -60,12 +61,13 @@ mod tests_support;
 mod voxel;
 mod walk;
 
+pub use at_hand::{Glimpse, render_at_hand};
 pub use lanes::Width;
 pub use progress::{Progress, Rendered, Stats};
 pub use pyramid::Pyramid;
 pub use seen::Unfit;
 pub use shade::shade;
-pub use sight::{Depths, Hit, Missing, Unseen, cast, depths, trace};
+pub use sight::{AtHand, Depths, Hit, Missing, Unseen, cast, depths, depths_at_hand, trace};
 
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;

@@ -7,6 +7,11 @@
 //! that is closest to the camera. So no point of the surface is further than the tolerance
 //! from level 0, in pixels across the line of sight. Which level a plot has depends on the
 //! view alone, not on the ray.
+//!
+//! Where the tile of a plot is not loaded, a picture that can wait leaves the plot open and
+//! names the tile. One that cannot ([`Lack::Coarser`]) sees the plot at the finest coarser
+//! level whose tile is loaded: where the ground of level 0 is, that of every coarser level
+//! is, too, so there is no hole. Such plots are counted.
 
 use crate::View;
 use crate::field::Field;
@@ -15,14 +20,23 @@ use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, as_bits};
 use crate::path::Ground;
 use crate::walk::post;
 use std::cell::RefCell;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::region::Region;
 use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TILE_POSTS, TileKey};
 use terrafarm_terrain::resident::Lookup;
 use terrafarm_terrain::tile::{HeightTile, Heights, MAXIMA_LEVELS, VOID};
 
-/// The coarsest level of a plot: a plot then is one cell.
-const COARSEST: usize = MAXIMA_LEVELS;
 /// A plot that nobody has asked for yet.
 const UNKNOWN: u32 = u32::MAX;
+
+/// What becomes of a plot whose tile is not loaded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Lack {
+    /// It stays open until the tile is loaded.
+    Open,
+    /// It is seen at a coarser level, if one is loaded there.
+    Coarser,
+}
 
 /// What the fast methods see of the only height layer of a store.
 pub(crate) struct Relief<'a> {
@@ -43,6 +57,7 @@ pub(crate) struct Relief<'a> {
     pub curvature: f64,
     /// Plots along x and y.
     pub plots: [i32; 2],
+    lack: Lack,
     known: RefCell<Known<'a>>,
 }
 
@@ -52,6 +67,8 @@ struct Known<'a> {
     places: Vec<u32>,
     plots: Vec<Plot<'a>>,
     wanted: Vec<TileKey>,
+    /// Some plot is seen at a coarser level than it should be.
+    any_coarser: bool,
 }
 
 /// How a plot is seen.
@@ -60,6 +77,8 @@ pub(crate) struct Plot<'a> {
     pub ground: Soil<'a>,
     /// Level, 0 the finest.
     pub level: u32,
+    /// That level is coarser than it should be, for want of a tile.
+    coarser: bool,
 }
 
 /// The tile under a plot.
@@ -74,7 +93,7 @@ pub(crate) enum Soil<'a> {
 
 impl<'a> Relief<'a> {
     /// The store must have one height layer, with at least one cell.
-    pub(crate) fn new(field: Field<'a>, view: &View, tolerance_px: f64) -> Self {
+    pub(crate) fn new(field: Field<'a>, view: &View, tolerance_px: f64, lack: Lack) -> Self {
         let (number, layer) =
             field.index().layers_of(LayerKind::Height).next().expect("the store has heights");
         let cells = cells_of(layer);
@@ -89,6 +108,7 @@ impl<'a> Relief<'a> {
             places: vec![UNKNOWN; plots[0] as usize * plots[1] as usize],
             plots: Vec::new(),
             wanted: Vec::new(),
+            any_coarser: false,
         };
         Relief {
             field,
@@ -102,6 +122,7 @@ impl<'a> Relief<'a> {
             cells,
             curvature: Ground::new(view.shading.earth).curvature(),
             plots,
+            lack,
             known: RefCell::new(known),
         }
     }
@@ -148,7 +169,7 @@ impl<'a> Relief<'a> {
             let number = numbers[left.bits().trailing_zeros() as usize % MOST];
             let here = left & plots.eq(L::I::splat(number));
             left = left & !here;
-            let Plot { ground: Soil::Tile(tile), level } = self.plot(number) else { continue };
+            let Plot { ground: Soil::Tile(tile), level, .. } = self.plot(number) else { continue };
             let base = L::I::splat(level as i32);
             let shrink = L::F::splat(1.0 / (1u32 << level) as f32);
             let (i, j) = (cell_x.shr(base), cell_y.shr(base));
@@ -177,30 +198,70 @@ impl<'a> Relief<'a> {
         wanted
     }
 
+    /// How many pixels of a region show ground of plots that are seen at a coarser level than
+    /// they should be, from one over their depths.
+    pub(crate) fn coarser_pixels(
+        &self,
+        camera: &Camera,
+        region: Region,
+        inverse_depth: &[f32],
+    ) -> u64 {
+        if !self.known.borrow().any_coarser {
+            return 0;
+        }
+        let shown = region.pixels().zip(inverse_depth).filter(|(_, inverse)| **inverse > 0.0);
+        let coarser = shown.filter(|([x, y], inverse)| {
+            let ray = camera.ray(f64::from(*x) + 0.5, f64::from(*y) + 0.5);
+            let along = [ray.x, ray.y].map(|part| part / f64::from(**inverse));
+            let [x, y] = [0, 1].map(|axis| {
+                let place = f64::from(self.eye_place[axis]) + along[axis] / self.spacing[axis];
+                let cell = place.floor() + f64::from(self.eye_cell[axis]);
+                (cell as i32).clamp(0, self.cells[axis] - 1) >> MAXIMA_LEVELS
+            });
+            self.plot(y * self.plots[0] + x).coarser
+        });
+        coarser.count() as u64
+    }
+
     #[cold]
     fn meet(&self, number: i32) -> Plot<'a> {
         let at = [number % self.plots[0], number / self.plots[0]];
         let level = self.level(at);
         let key = self.key(at, level);
         let finest = self.layer.entry(0, at[0] as u32, at[1] as u32);
-        let ground = if finest.is_none_or(|entry| entry.is_empty()) {
-            Soil::Void
-        } else {
-            self.field.resident.touch(key);
-            match self.field.resident.height(key) {
-                Lookup::Found(tile) => Soil::Tile(tile),
-                Lookup::Empty => Soil::Void,
-                Lookup::Absent => Soil::Absent,
-            }
-        };
-        let plot = Plot { ground, level: level as u32 };
         let known = &mut *self.known.borrow_mut();
-        if matches!(ground, Soil::Absent) {
-            known.wanted.push(key);
+        let mut plot = Plot { ground: Soil::Void, level: level as u32, coarser: false };
+        if finest.is_some_and(|entry| !entry.is_empty()) {
+            plot.ground = self.soil(key);
+            if matches!(plot.ground, Soil::Absent) {
+                known.wanted.push(key);
+                if self.lack == Lack::Coarser {
+                    plot = self.coarser(at, level).unwrap_or(plot);
+                    known.any_coarser |= plot.coarser;
+                }
+            }
         }
         known.places[number as usize] = known.plots.len() as u32;
         known.plots.push(plot);
         plot
+    }
+
+    fn soil(&self, key: TileKey) -> Soil<'a> {
+        self.field.resident.touch(key);
+        match self.field.resident.height(key) {
+            Lookup::Found(tile) => Soil::Tile(tile),
+            Lookup::Empty => Soil::Void,
+            Lookup::Absent => Soil::Absent,
+        }
+    }
+
+    /// A plot at the finest of the levels coarser than this one whose tile is loaded.
+    fn coarser(&self, plot: [i32; 2], level: usize) -> Option<Plot<'a>> {
+        (level + 1..=self.layer.root_level()).find_map(|level| {
+            let ground = self.soil(self.key(plot, level));
+            let loaded = matches!(ground, Soil::Tile(_));
+            loaded.then_some(Plot { ground, level: level as u32, coarser: true })
+        })
     }
 
     /// The tile of a level that a plot lies in.
@@ -217,8 +278,7 @@ impl<'a> Relief<'a> {
             let entry = self.layer.entry(level, key.tx, key.ty);
             entry.is_some_and(|entry| f64::from(entry.deviation) <= allowed)
         };
-        let last = COARSEST.min(self.layer.levels.len() - 1);
-        (1..=last).take_while(fits).last().unwrap_or(0)
+        (1..=self.layer.root_level()).take_while(fits).last().unwrap_or(0)
     }
 
     /// Distance from the camera to the box of a plot, metres.

@@ -16,13 +16,15 @@ pub(crate) struct Seen {
     pub rays: u64,
     /// Pixels that fell back to a ray of their own.
     pub alone: u64,
+    /// Pixels that show a coarser level than they should, for want of a tile.
+    pub coarser: u64,
 }
 
 impl Seen {
     /// Nothing is known of any pixel.
     pub(crate) fn new(region: Region) -> Self {
         let inverse_depth = vec![f32::NAN; region.area() as usize];
-        Seen { inverse_depth, steps: 0, rays: 0, alone: 0 }
+        Seen { inverse_depth, steps: 0, rays: 0, alone: 0, coarser: 0 }
     }
 }
 

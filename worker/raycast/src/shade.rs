@@ -150,6 +150,11 @@ impl<'a> Shader<'a> {
         }
     }
 
+    /// Shades as if pixels were so many times as wide.
+    pub(crate) fn widen(&mut self, times: f32) {
+        self.sample_tangent *= times;
+    }
+
     /// The light of places, red, green and blue apart: NaN where a tile is missing. Some
     /// hundred places at a time make good use of it; all slices have one length.
     pub(crate) fn shade(&mut self, places: Places, light: [&mut [f32]; 3]) {

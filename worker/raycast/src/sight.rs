@@ -10,7 +10,8 @@ use crate::painter::{Caster, path, squares};
 use crate::path::{Ground, Path};
 use crate::progress::Stats;
 use crate::pyramid::Pyramid;
-use crate::seen::Unfit;
+use crate::relief::Lack;
+use crate::seen::{Seen, Unfit};
 use glam::DVec3;
 use std::collections::BTreeSet;
 use terrafarm_common::region::Region;
@@ -159,7 +160,32 @@ pub struct Depths {
     pub stats: Stats,
 }
 
+/// Depths with the tiles at hand; see [`depths_at_hand`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct AtHand {
+    /// What is seen: the same as [`depths`] finds if nothing is wanted.
+    pub depths: Depths,
+    /// Pixels that show ground at a coarser level than the tolerance asks for.
+    pub coarser: u64,
+    /// The tiles that a picture to the tolerance needs and that are not loaded, sorted.
+    pub wanted: Vec<TileKey>,
+}
+
+impl AtHand {
+    /// Whether a tile was missing: the picture may be off by more than the tolerance, also
+    /// where it shows other ground than that of the missing tile.
+    pub fn is_degraded(&self) -> bool {
+        !self.wanted.is_empty()
+    }
+}
+
 impl Depths {
+    fn new(region: Region, seen: Seen) -> Self {
+        let stats =
+            Stats { rays: seen.rays, steps: seen.steps, fallbacks: seen.alone, ..Stats::default() };
+        Depths { region, inverse_depth: seen.inverse_depth, stats }
+    }
+
     /// Straight distance from the camera of what a pixel of the region shows, metres;
     /// infinite for the sky. The view must be the same.
     pub fn distance_m(&self, view: &View, x: u32, y: u32) -> f64 {
@@ -196,9 +222,7 @@ pub fn depths(
         if !wanted.is_empty() {
             return Err(Unseen::Missing(wanted));
         }
-        let stats =
-            Stats { rays: seen.rays, steps: seen.steps, fallbacks: seen.alone, ..Stats::default() };
-        return Ok(Depths { region, inverse_depth: seen.inverse_depth, stats });
+        return Ok(Depths::new(region, seen));
     }
     let mut inverse_depth = vec![0.0; region.area() as usize];
     let stats = sweep(resident, pyramid, view, region, |many, ray, [x, y]| {
@@ -208,6 +232,42 @@ pub fn depths(
         }
     })?;
     Ok(Depths { region, inverse_depth, stats })
+}
+
+/// How far away is what is seen, for a picture that cannot wait: where the tile that a
+/// method needs is not loaded, it sees the finest coarser level whose tile is. The answer
+/// says how many pixels show such ground, and which tiles would have been needed; load
+/// these, and the next picture is better. Keep the
+/// [roots](terrafarm_terrain::layout::StoreIndex::roots) loaded, and there is always some
+/// ground to see.
+///
+/// `lod` and `column` do this. The other methods wait for their tiles: they give the same
+/// answers as [`depths`].
+///
+/// # Errors
+/// If not even a coarser tile is loaded, or the method waits for a tile, or it is not made
+/// for the view.
+pub fn depths_at_hand(
+    resident: &Resident,
+    pyramid: &Pyramid,
+    view: &View,
+    region: Region,
+) -> Result<AtHand, Unseen> {
+    let field = Field { resident, pyramid };
+    let method = match Look::of(field, view)? {
+        Look::Fast(method @ (fast::Method::Lod | fast::Method::Column)) => method,
+        _ => {
+            let depths = depths(resident, pyramid, view, region)?;
+            return Ok(AtHand { depths, coarser: 0, wanted: Vec::new() });
+        }
+    };
+    let width = lanes::widest();
+    let (seen, wanted) = fast::see_with(field, view, region, method, width, Lack::Coarser)?;
+    if seen.inverse_depth.iter().any(|inverse| inverse.is_nan()) {
+        return Err(Unseen::Missing(wanted));
+    }
+    let coarser = seen.coarser;
+    Ok(AtHand { depths: Depths::new(region, seen), coarser, wanted })
 }
 
 impl Hit {

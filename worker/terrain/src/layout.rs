@@ -14,6 +14,8 @@ use terrafarm_common::id::BlobHash;
 pub const STORE_VERSION: u32 = 1;
 /// Cells along a side of a tile.
 pub const TILE_CELLS: usize = 256;
+/// log2 of that.
+const TILE_BITS: usize = TILE_CELLS.ilog2() as usize;
 /// Posts kept beyond the tile's own 257 on each side, so that slopes at its border
 /// need no neighbour.
 pub const TILE_RING: usize = 1;
@@ -208,6 +210,13 @@ impl Layer {
         [0, 1].map(|axis| self.origin[axis] + (self.posts[axis] - 1) as f64 * self.spacing[axis])
     }
 
+    /// The coarsest level at which a tile of level 0 is a cell at least: the last one, but
+    /// for layers of more than 65 537 posts a side. Its tiles are the *roots* of the layer:
+    /// whoever has them has some ground everywhere.
+    pub fn root_level(&self) -> usize {
+        TILE_BITS.min(self.levels.len().saturating_sub(1))
+    }
+
     /// The entry of a tile, if there is such a tile.
     pub fn entry(&self, level: usize, tx: u32, ty: u32) -> Option<&TileEntry> {
         let level = self.levels.get(level)?;
@@ -227,6 +236,20 @@ impl StoreIndex {
     /// The entry of a tile, if there is such a tile.
     pub fn entry(&self, key: TileKey) -> Option<&TileEntry> {
         self.layers.get(usize::from(key.layer))?.entry(usize::from(key.level), key.tx, key.ty)
+    }
+
+    /// The tiles of all layers at their [`Layer::root_level`] that hold anything.
+    pub fn roots(&self) -> Vec<TileKey> {
+        let mut roots = Vec::new();
+        for (number, layer) in self.layers.iter().enumerate() {
+            let level = layer.root_level();
+            let Some(grid) = layer.levels.get(level) else { continue };
+            for (at, _) in grid.entries.iter().enumerate().filter(|(_, entry)| !entry.is_empty()) {
+                let (tx, ty) = (at as u32 % grid.tiles[0], at as u32 / grid.tiles[0]);
+                roots.push(TileKey { layer: number as u16, level: level as u16, tx, ty });
+            }
+        }
+        roots
     }
 
     /// The layers of one kind, with their indices.

@@ -173,6 +173,11 @@ impl Resident {
         evicted
     }
 
+    /// Whether a tile is loaded.
+    pub fn is_loaded(&self, key: TileKey) -> bool {
+        matches!(self.slot(key), Some(Slot::Loaded(_)))
+    }
+
     /// The loaded tiles, in the order of keys within each row.
     pub fn loaded(&self) -> impl Iterator<Item = TileKey> + '_ {
         self.slots.iter().enumerate().flat_map(move |(layer, levels)| {

@@ -3,7 +3,7 @@
 //! What is made is written as a store to a temporary folder and read back: a method sees
 //! the same coarser levels and error bounds as in a render.
 
-mod noise;
+pub mod noise;
 
 use anyhow::{Context, bail};
 use std::path::Path;

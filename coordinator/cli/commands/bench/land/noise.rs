@@ -17,19 +17,55 @@ const RANGE_M: (f32, f32) = (0.0, 6500.0);
 
 /// Height of a post, metres.
 pub fn height(i: u64, j: u64) -> f32 {
-    let (mut wave, mut amplitude, mut seed) = (LONGEST_POSTS, RELIEF_M, SEED);
-    let mut sum = MEAN_M;
-    while wave >= 2 {
-        sum += amplitude * octave(i, j, wave, seed);
-        amplitude *= PERSISTENCE;
-        wave /= 2;
-        seed += 1;
+    let sum = octaves()
+        .fold(MEAN_M, |sum, (wave, amplitude, seed)| sum + amplitude * octave(i, j, wave, seed));
+    in_steps(sum)
+}
+
+/// Heights of a row of posts from (i, j) eastwards, bit for bit those of [`height`]: what
+/// neighbours share is computed once.
+pub fn row(i: u64, j: u64, into: &mut [f32]) {
+    into.fill(MEAN_M);
+    for (wave, amplitude, seed) in octaves() {
+        let (row, v) = (j / wave, ease((j % wave) as f32 / wave as f32));
+        let corners = |column| [unit(column, row, seed), unit(column, row + 1, seed)];
+        let [mut sw, mut nw] = corners(i / wave);
+        let mut post = i;
+        let mut rest = &mut *into;
+        while !rest.is_empty() {
+            let [se, ne] = corners(post / wave + 1);
+            let count = ((wave - post % wave) as usize).min(rest.len());
+            let (cell, after) = rest.split_at_mut(count);
+            for (sum, step) in cell.iter_mut().zip(post % wave..) {
+                let u = ease(step as f32 / wave as f32);
+                let (south, north) = (sw + (se - sw) * u, nw + (ne - nw) * u);
+                *sum += amplitude * (south + (north - south) * v);
+            }
+            [sw, nw] = [se, ne];
+            post += count as u64;
+            rest = after;
+        }
     }
-    (sum.clamp(RANGE_M.0, RANGE_M.1) / QUANTUM_M).round() * QUANTUM_M
+    into.iter_mut().for_each(|height| *height = in_steps(*height));
+}
+
+/// Wavelengths in posts, amplitudes in metres, and seeds.
+fn octaves() -> impl Iterator<Item = (u64, f32, u64)> {
+    let next = |&(wave, amplitude, seed): &(u64, f32, u64)| {
+        (wave > 2).then(|| (wave / 2, amplitude * PERSISTENCE, seed + 1))
+    };
+    std::iter::successors(Some((LONGEST_POSTS, RELIEF_M, SEED)), next)
+}
+
+fn in_steps(height: f32) -> f32 {
+    (height.clamp(RANGE_M.0, RANGE_M.1) / QUANTUM_M).round() * QUANTUM_M
+}
+
+fn ease(t: f32) -> f32 {
+    t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
 
 fn octave(i: u64, j: u64, wave: u64, seed: u64) -> f32 {
-    let ease = |t: f32| t * t * t * (t * (t * 6.0 - 15.0) + 10.0);
     let (column, row) = (i / wave, j / wave);
     let u = ease((i % wave) as f32 / wave as f32);
     let v = ease((j % wave) as f32 / wave as f32);
@@ -52,6 +88,18 @@ pub fn unit(x: u64, y: u64, seed: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_row_is_its_posts_bit_for_bit() {
+        for (i, j) in [(0, 0), (1_048_570, 1_048_577), (77, 1023), (1, 512)] {
+            let mut heights = [0.0; 259];
+            row(i, j, &mut heights);
+            for (post, height) in (i..).zip(heights) {
+                assert_eq!(height.to_bits(), super::height(post, j).to_bits(), "{post} {j}");
+            }
+        }
+        row(5, 5, &mut []);
+    }
 
     #[test]
     fn relief_is_about_two_kilometres_and_rough_from_post_to_post() {
