@@ -114,6 +114,9 @@ pub(crate) trait Ints:
     fn splat(value: i32) -> Self;
     fn load(values: &[i32]) -> Self;
     fn store(self, values: &mut [i32]);
+    /// The three low bytes of each lane, one lane's behind the other's, into the first 3 N
+    /// places of a slice; panics if there are fewer.
+    fn store_threes(self, bytes: &mut [u8]);
     /// The nearest f32.
     fn to_floats(self) -> Self::F;
     /// Each lane shifted by the other's lane, 0 to 31, with its sign.

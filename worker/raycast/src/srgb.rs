@@ -38,7 +38,6 @@ impl Kernel for Encode<'_> {
     #[inline(always)]
     fn run<L: Lanes>(self) {
         let [red, green, blue] = self.light;
-        let mut colors = [0i32; MOST];
         for (n, pixels) in self.pixels.chunks_mut(3 * L::N).enumerate() {
             let at = n * L::N;
             let count = pixels.len() / 3;
@@ -51,15 +50,23 @@ impl Kernel for Encode<'_> {
                 }
                 [L::F::load(&part[0]), L::F::load(&part[1]), L::F::load(&part[2])]
             };
-            let color = bytes::<L>(r)
-                + bytes::<L>(g).shl(L::I::splat(8))
-                + bytes::<L>(b).shl(L::I::splat(16));
-            color.store(&mut colors);
-            for (pixel, color) in pixels.chunks_exact_mut(3).zip(&colors) {
-                let [red, green, blue, _] = color.to_le_bytes();
-                pixel.copy_from_slice(&[red, green, blue]);
-            }
+            store::<L>([r, g, b], pixels);
         }
+    }
+}
+
+/// The bytes of a vector of colours, three a pixel; as many pixels as there is room for.
+#[inline(always)]
+pub(crate) fn store<L: Lanes>([red, green, blue]: [L::F; 3], pixels: &mut [u8]) {
+    let color = bytes::<L>(red)
+        + bytes::<L>(green).shl(L::I::splat(8))
+        + bytes::<L>(blue).shl(L::I::splat(16));
+    if pixels.len() >= 3 * L::N {
+        color.store_threes(pixels);
+    } else {
+        let mut all = [0; 3 * MOST];
+        color.store_threes(&mut all);
+        pixels.copy_from_slice(&all[..pixels.len()]);
     }
 }
 

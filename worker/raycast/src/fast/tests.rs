@@ -5,6 +5,7 @@ use crate::oracle::{Dice, Land, bare, count, lands};
 use crate::tests_support::{Plan, mountains, store};
 use crate::{Pyramid, Unseen, depths};
 use glam::DVec3;
+use terrafarm_common::camera::Camera;
 use terrafarm_common::shading::Earth;
 
 const SIZE: (u32, u32) = (80, 60);

@@ -191,6 +191,20 @@ impl Ints for I {
         unsafe { _mm256_storeu_si256(values[..8].as_mut_ptr().cast(), self.0) }
     }
     #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        let bytes = &mut bytes[..24];
+        // SAFETY: see the page of this module; sixteen bytes and eight.
+        unsafe {
+            let order = _mm_setr_epi8(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1);
+            let dense = _mm256_shuffle_epi8(self.0, _mm256_broadcastsi128_si256(order));
+            let places = _mm256_setr_epi32(0, 1, 2, 4, 5, 6, 3, 7);
+            let dense = _mm256_permutevar8x32_epi32(dense, places);
+            _mm_storeu_si128(bytes.as_mut_ptr().cast(), _mm256_castsi256_si128(dense));
+            let rest = _mm256_extracti128_si256::<1>(dense);
+            _mm_storel_epi64(bytes[16..].as_mut_ptr().cast(), rest);
+        }
+    }
+    #[inline(always)]
     fn to_floats(self) -> F {
         // SAFETY: see the page of this module.
         unsafe { F(_mm256_cvtepi32_ps(self.0)) }

@@ -196,6 +196,20 @@ impl Ints for I {
         unsafe { _mm512_storeu_si512(values[..16].as_mut_ptr().cast(), self.0) }
     }
     #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        let bytes = &mut bytes[..48];
+        // SAFETY: see the page of this module; thirty-two bytes and sixteen.
+        unsafe {
+            let order = _mm_setr_epi8(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1);
+            let dense = _mm512_shuffle_epi8(self.0, _mm512_broadcast_i32x4(order));
+            let places = _mm512_setr_epi32(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, 3, 7, 11, 15);
+            let dense = _mm512_permutexvar_epi32(places, dense);
+            _mm256_storeu_si256(bytes.as_mut_ptr().cast(), _mm512_castsi512_si256(dense));
+            let rest = _mm512_extracti32x4_epi32::<2>(dense);
+            _mm_storeu_si128(bytes[32..].as_mut_ptr().cast(), rest);
+        }
+    }
+    #[inline(always)]
     fn to_floats(self) -> F {
         // SAFETY: see the page of this module.
         unsafe { F(_mm512_cvtepi32_ps(self.0)) }

@@ -159,6 +159,10 @@ impl Ints for I {
         values[0] = self.0;
     }
     #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        bytes[..3].copy_from_slice(&self.0.to_le_bytes()[..3]);
+    }
+    #[inline(always)]
     fn to_floats(self) -> F {
         F(self.0 as f32)
     }
