@@ -144,9 +144,10 @@ pub(crate) trait Ints:
     /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
     /// lanes outside get 0. An index outside the table reads from its end.
     fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
-    /// For each lane in `mask` the elements `at` to `at + 3` of a table of at least four,
-    /// as pairs; as above.
-    fn gather_fours(table: &[u16], at: Self, mask: Self::M) -> (Self, Self);
+    /// For each lane in `mask` the elements `at` to `at + 3` of a table, as pairs, and those
+    /// `stride` elements on, and again, four times; lanes outside get 0. An index outside
+    /// the table reads from its end. Panics if the table has fewer than 3 `stride` + 4.
+    fn gather_rows(table: &[u16], at: Self, stride: usize, mask: Self::M) -> [(Self, Self); 4];
 }
 
 /// A yes or no a lane.

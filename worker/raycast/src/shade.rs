@@ -30,8 +30,10 @@ use crate::{Pyramid, View, srgb};
 use air::Air;
 use footprint::Footprint;
 use glam::DVec3;
+use photo::{Rows, Sums};
 use ray::{Lens, Ray};
 use sheets::Sheets;
+use slope::Cells;
 use std::collections::BTreeSet;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -191,12 +193,8 @@ impl<'a> Shader<'a> {
         for n in 0..vectors {
             self.rays::<L>(batch, n);
         }
-        for n in 0..vectors {
-            self.slopes::<L>(batch, n);
-        }
-        for n in 0..vectors {
-            self.photos::<L>(batch, n);
-        }
+        self.slopes::<L>(batch, vectors);
+        self.photos::<L>(batch, vectors);
         for n in 0..vectors {
             self.colors::<L>(batch, n);
         }
@@ -213,6 +211,7 @@ impl<'a> Shader<'a> {
         let ground = depth.le(L::F::splat(f32::MAX));
         batch.ground[n] = ground.bits();
         batch.sky[n] = L::F::splat(f32::MAX).lt(depth).bits();
+        batch.unsure[n] = 0;
         for part in 0..3 {
             ray.view[part].store(&mut batch.view[part][at..]);
         }
@@ -228,49 +227,78 @@ impl<'a> Shader<'a> {
         }
     }
 
-    /// Slopes of the ground.
+    /// Slopes of the ground: each place's by the uppermost layer that is there.
     #[inline(always)]
-    fn slopes<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
-        let at = n * L::N;
-        let ground = L::M::from_bits(batch.ground[n]);
-        if !ground.any() {
-            return;
+    fn slopes<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
+        batch.slopes = [[0.0; AT_ONCE]; 2];
+        let mut left = batch.ground;
+        for (number, sheets) in self.heights.iter_mut().enumerate().rev() {
+            for n in 0..vectors {
+                let at = n * L::N;
+                if left[n] == 0 {
+                    batch.cells.leave(n);
+                    continue;
+                }
+                let size = L::F::load(&batch.size[at..]);
+                let (along, lanes) = (batch.along::<L>(at), L::M::from_bits(left[n]));
+                batch.cells.lay::<L>(sheets, n, along, size, lanes, number == 0);
+                left[n] &= !batch.cells.lanes[n];
+            }
+            for is_coarser in [false, true] {
+                for n in 0..vectors {
+                    batch.cells.place::<L>(sheets, n, is_coarser);
+                }
+                for n in 0..vectors {
+                    let (slopes, wanted) = (&mut batch.slopes, &mut self.wanted);
+                    batch.cells.read::<L>(
+                        sheets,
+                        n,
+                        is_coarser,
+                        slopes,
+                        &mut batch.unsure[n],
+                        wanted,
+                    );
+                }
+            }
         }
-        let size = L::F::load(&batch.size[at..]);
-        let along = batch.along::<L>(at);
-        let found = slope::slopes::<L>(&mut self.heights, along, size, ground, &mut self.wanted);
-        found.slopes[0].store(&mut batch.slopes[0][at..]);
-        found.slopes[1].store(&mut batch.slopes[1][at..]);
-        batch.unsure[n] = found.unsure.bits();
     }
 
-    /// What the photos show, in sunlight.
+    /// What the photos show, from the topmost down.
     #[inline(always)]
-    fn photos<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
-        let at = n * L::N;
-        let ground = L::M::from_bits(batch.ground[n]);
-        if !ground.any() {
-            return;
+    fn photos<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
+        batch.light = [[0.0; AT_ONCE]; 3];
+        batch.covered = [0.0; AT_ONCE];
+        let sides = [self.lens.right, self.lens.up];
+        for sheets in self.photos.iter_mut().rev() {
+            for n in 0..vectors {
+                let at = n * L::N;
+                if batch.ground[n] == 0 {
+                    batch.rows.leave(n);
+                    continue;
+                }
+                let size = L::F::load(&batch.size[at..]);
+                let [x, y, z] = batch.view::<L>(at);
+                let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
+                let footprint = Footprint::<L>::new(sides, size, arriving, batch.slopes::<L>(at));
+                let (along, ground) = (batch.along::<L>(at), L::M::from_bits(batch.ground[n]));
+                let covered = L::F::load(&batch.covered[at..]);
+                batch.rows.lay::<L>(sheets, n, along, &footprint, ground, covered);
+            }
+            for is_coarser in [false, true] {
+                for n in 0..vectors {
+                    batch.rows.place::<L>(sheets, n, is_coarser);
+                }
+                let mut sums = Sums {
+                    light: &mut batch.light,
+                    coverage: &mut batch.covered,
+                    unsure: &mut batch.unsure,
+                };
+                for n in 0..vectors {
+                    let wanted = &mut self.wanted;
+                    batch.rows.read::<L>(sheets, n, is_coarser, &mut sums, wanted);
+                }
+            }
         }
-        let mut color = [L::F::splat(0.0); 3];
-        let mut covered = L::F::splat(0.0);
-        if !self.photos.is_empty() {
-            let size = L::F::load(&batch.size[at..]);
-            let sides = [self.lens.right, self.lens.up];
-            let [x, y, z] = batch.view::<L>(at);
-            let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
-            let slopes = batch.slopes::<L>(at);
-            let footprint = Footprint::<L>::new(sides, size, arriving, slopes);
-            let along = batch.along::<L>(at);
-            let wanted = &mut self.wanted;
-            let photo = photo::sample::<L>(&mut self.photos, along, &footprint, ground, wanted);
-            (color, covered) = (photo.light, photo.coverage);
-            batch.unsure[n] |= photo.unsure.bits();
-        }
-        for c in 0..3 {
-            color[c].store(&mut batch.light[c][at..]);
-        }
-        covered.store(&mut batch.covered[at..]);
     }
 
     /// The light that comes in.
@@ -306,7 +334,7 @@ impl<'a> Shader<'a> {
     /// Photo, and tint where there is none, in sunlight.
     #[inline(always)]
     fn ground<L: Lanes>(&self, batch: &Batch, at: usize, over: L::F) -> [L::F; 3] {
-        let mut color = batch.light::<L>(at);
+        let mut color = photo::light::<L>(batch.light::<L>(at));
         let slopes = batch.slopes::<L>(at);
         let covered = L::F::load(&batch.covered[at..]);
         let open = covered.lt(L::F::splat(COVERED));
@@ -358,6 +386,8 @@ struct Batch {
     slopes: [[f32; AT_ONCE]; 2],
     light: [[f32; AT_ONCE]; 3],
     covered: [f32; AT_ONCE],
+    cells: Cells,
+    rows: Rows,
 }
 
 impl Batch {
@@ -381,6 +411,8 @@ impl Batch {
             slopes: [none; 2],
             light: [none; 3],
             covered: none,
+            cells: Cells::new(),
+            rows: Rows::new(),
         }
     }
 

@@ -277,10 +277,20 @@ impl Ints for I {
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
-    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
-        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
-        // SAFETY: see the page of this module; element `last + 3` is inside the table.
-        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
+        let rest = table.len().min(i32::MAX as usize).checked_sub(3 * stride + 4);
+        let last = rest.expect("a table has four rows") as i32;
+        // SAFETY: see the page of this module; element `last + 3 * stride + 3` is inside the
+        // table.
+        unsafe {
+            let first = table.as_ptr();
+            [
+                gather_eights::<2>(first.cast(), at, last, mask),
+                gather_eights::<2>(first.add(stride).cast(), at, last, mask),
+                gather_eights::<2>(first.add(2 * stride).cast(), at, last, mask),
+                gather_eights::<2>(first.add(3 * stride).cast(), at, last, mask),
+            ]
+        }
     }
 }
 
