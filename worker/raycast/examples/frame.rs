@@ -1,4 +1,4 @@
-//! What a frame of a flight takes on one core, stage by stage: `frame STORE [RUNS]`.
+//! What a frame of a flight takes on one core, stage by stage: `frame STORE [RUNS [pieces]]`.
 //!
 //! ```sh
 //! terrafarm terrain synth --size 2049 --spacing 15 --seed 3 --photo-scale 2 -o demo.terrain
@@ -7,8 +7,8 @@
 //!
 //! The store is that of `terrafarm demo`, the views are three of its flight, 1920 x 1080, by
 //! the method `auto`. A line a view, nanoseconds a pixel of one thread, the best of RUNS (9)
-//! runs: finding depths alone, shading alone, the whole frame, and the whole in pieces of
-//! several sides, depths and all.
+//! runs: finding depths alone, shading alone, the whole frame, and if asked for depths and
+//! the whole in pieces of several sides. At the end a hash of the bytes.
 
 #[allow(dead_code)]
 #[path = "../src/tests_support.rs"]
@@ -41,6 +41,7 @@ fn main() {
     let mut arguments = std::env::args().skip(1);
     let path = arguments.next().expect("the first argument is a store");
     let runs = arguments.next().map_or(9, |text| text.parse().expect("a number of runs"));
+    let pieces = if arguments.next().is_some() { &PIECES[..] } else { &[] };
     let resident = loaded(Path::new(&path));
     let pyramid = Pyramid::new(resident.index());
     let frame = Region::whole(SIZE.0, SIZE.1);
@@ -58,11 +59,11 @@ fn main() {
         let sky = distances.iter().filter(|s| s.is_infinite()).count();
         print!(
             "trace {trace:6.2}   shade {shading:6.2}   frame {whole:6.2}   beside the trace {:6.2}   \
-             sky {:4.1} %   pieces",
+             sky {:4.1} %",
             whole - trace,
             100.0 * sky as f64 / distances.len() as f64
         );
-        for [width, height] in PIECES {
+        for &[width, height] in pieces {
             let regions: Vec<Region> = (0..SIZE.1)
                 .step_by(height)
                 .flat_map(|y| (0..SIZE.0).step_by(width).map(move |x| (x, y)))

@@ -65,6 +65,8 @@ pub(crate) trait Floats:
     /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
     /// if the table has fewer.
     fn lookup(table: &[f32], at: Self::I) -> Self;
+    /// For each lane the element `at` of a table, of its low four bits.
+    fn pick(table: &[f32; 16], at: Self::I) -> Self;
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);

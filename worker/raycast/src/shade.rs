@@ -28,7 +28,7 @@ use crate::field::{Field, Wanted};
 use crate::lanes::{self, Floats, Kernel, Lanes, MOST, Mask, Width};
 use crate::{Pyramid, View, srgb};
 use air::Air;
-use footprint::Footprint;
+use footprint::{Footprint, steepness};
 use glam::DVec3;
 use photo::{Rows, Sums};
 use ray::{Lens, Ray};
@@ -193,8 +193,10 @@ impl<'a> Shader<'a> {
         for n in 0..vectors {
             self.rays::<L>(batch, n);
         }
-        self.slopes::<L>(batch, vectors);
-        self.photos::<L>(batch, vectors);
+        if batch.ground[..vectors].iter().any(|&ground| ground != 0) {
+            self.slopes::<L>(batch, vectors);
+            self.photos::<L>(batch, vectors);
+        }
         for n in 0..vectors {
             self.colors::<L>(batch, n);
         }
@@ -266,6 +268,10 @@ impl<'a> Shader<'a> {
     /// What the photos show, from the topmost down.
     #[inline(always)]
     fn photos<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
+        for n in 0..vectors {
+            let at = n * L::N;
+            steepness::<L>(batch.slopes::<L>(at)).store(&mut batch.steepness[at..]);
+        }
         batch.light = [[0.0; AT_ONCE]; 3];
         batch.covered = [0.0; AT_ONCE];
         let sides = [self.lens.right, self.lens.up];
@@ -279,7 +285,9 @@ impl<'a> Shader<'a> {
                 let size = L::F::load(&batch.size[at..]);
                 let [x, y, z] = batch.view::<L>(at);
                 let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
-                let footprint = Footprint::<L>::new(sides, size, arriving, batch.slopes::<L>(at));
+                let (slopes, steepness) =
+                    (batch.slopes::<L>(at), L::F::load(&batch.steepness[at..]));
+                let footprint = Footprint::<L>::new(sides, size, arriving, slopes, steepness);
                 let (along, ground) = (batch.along::<L>(at), L::M::from_bits(batch.ground[n]));
                 let covered = L::F::load(&batch.covered[at..]);
                 batch.rows.lay::<L>(sheets, n, along, &footprint, ground, covered);
@@ -352,7 +360,7 @@ impl<'a> Shader<'a> {
             }
         }
         if let Some(sun) = &self.sun {
-            let light = sun.light::<L>(slopes);
+            let light = sun.light::<L>(slopes, L::F::load(&batch.steepness[at..]));
             for channel in &mut color {
                 *channel = *channel * light;
             }
@@ -384,6 +392,7 @@ struct Batch {
     falls: [f32; AT_ONCE],
     size: [f32; AT_ONCE],
     slopes: [[f32; AT_ONCE]; 2],
+    steepness: [f32; AT_ONCE],
     light: [[f32; AT_ONCE]; 3],
     covered: [f32; AT_ONCE],
     cells: Cells,
@@ -409,6 +418,7 @@ impl Batch {
             falls: none,
             size: none,
             slopes: [none; 2],
+            steepness: none,
             light: [none; 3],
             covered: none,
             cells: Cells::new(),
@@ -550,11 +560,10 @@ impl Sunlight {
 
     /// Light on ground of the given slopes; see the module's page.
     #[inline(always)]
-    fn light<L: Lanes>(&self, slopes: [L::F; 2]) -> L::F {
+    fn light<L: Lanes>(&self, slopes: [L::F; 2], steepness: L::F) -> L::F {
         let [x, y, z] = self.direction;
-        let steep = slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0);
         let facing = L::F::splat(z) - slopes[0] * L::F::splat(x) - slopes[1] * L::F::splat(y);
-        let facing = facing.max(L::F::splat(0.0)).div(steep.sqrt());
+        let facing = facing.max(L::F::splat(0.0)).div(steepness);
         let light = L::F::splat(self.ambient) + L::F::splat(self.direct) * facing;
         light.min(L::F::splat(self.most))
     }

@@ -159,6 +159,10 @@ impl Floats for F {
         }
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        F::lookup(table, at)
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         let (mut values, mut places) = ([0.0; 8], [0; 8]);
         self.store(&mut values);

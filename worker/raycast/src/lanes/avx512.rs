@@ -167,6 +167,11 @@ impl Floats for F {
         }
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_permutexvar_ps(at.0, _mm512_loadu_ps(table.as_ptr()))) }
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         let last = (table.len().min(i32::MAX as usize) - 1) as i32;
         // SAFETY: see the page of this module.

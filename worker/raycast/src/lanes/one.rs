@@ -135,6 +135,10 @@ impl Floats for F {
         F(table[..2][at.0 as usize & 1])
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        F(table[at.0 as usize & 15])
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         if mask.0 {
             let last = table.len() - 1;

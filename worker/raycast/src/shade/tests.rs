@@ -14,7 +14,8 @@ const SIZE: (u32, u32) = (170, 96);
 
 fn light(sun: &Sun, slopes: [f32; 2]) -> f32 {
     let mut out = [0.0];
-    Sunlight::new(sun).light::<One>(slopes.map(Floats::splat)).store(&mut out);
+    let slopes = slopes.map(Floats::splat);
+    Sunlight::new(sun).light::<One>(slopes, steepness::<One>(slopes)).store(&mut out);
     out[0]
 }
 
