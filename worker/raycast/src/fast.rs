@@ -9,7 +9,6 @@ use crate::lod::Lod;
 use crate::relief::{Lack, Relief};
 use crate::seen::{Seen, Unfit};
 use crate::voxel;
-use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{self, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_terrain::layout::{LayerKind, StoreIndex, TileKey};
@@ -19,8 +18,6 @@ use terrafarm_terrain::layout::{LayerKind, StoreIndex, TileKey};
 const LEAST_FOR_COLUMN_PX: f64 = 0.1;
 /// The least tolerance that level of detail in single precision keeps.
 const LEAST_FOR_LOD_PX: f64 = 0.02;
-/// The least part of a ray along the map, as a share of its length, that counts.
-const STEEPEST: f64 = 1e-6;
 
 /// How a view is looked at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -141,24 +138,6 @@ pub(crate) fn supersampled(view: &View, region: Region, samples: u32) -> (View, 
     let Region { x, y, width, height } = region;
     let [x, y, width, height] = [x, y, width, height].map(|length| length * samples);
     (fine, Region { x, y, width, height })
-}
-
-/// Map distances of what the pixels of a row of a region see, metres, from one over their
-/// depths: as [`crate::shade::Places`] has them.
-pub(crate) fn map_distances(
-    camera: &Camera,
-    region: Region,
-    row: u32,
-    inverse_depth: &[f32],
-    s: &mut [f32],
-) {
-    let first = camera.ray(f64::from(region.x) + 0.5, f64::from(region.y + row) + 0.5);
-    let step = camera.ray(f64::from(region.x) + 1.5, f64::from(region.y + row) + 0.5) - first;
-    for (at, (s, &inverse)) in s.iter_mut().zip(inverse_depth).enumerate() {
-        let ray = first + step * at as f64;
-        let across = (ray.x * ray.x + ray.y * ray.y).sqrt().max(STEEPEST * ray.length());
-        *s = across as f32 / inverse;
-    }
 }
 
 #[cfg(test)]

@@ -66,6 +66,8 @@ pub(crate) trait Floats:
     /// For each lane the element `at` of a table: from 0 to below twice the lanes. Panics
     /// if the table has fewer.
     fn lookup(table: &[f32], at: Self::I) -> Self;
+    /// For each lane the element `at` of a table, of its low four bits.
+    fn pick(table: &[f32; 16], at: Self::I) -> Self;
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
@@ -115,6 +117,9 @@ pub(crate) trait Ints:
     fn splat(value: i32) -> Self;
     fn load(values: &[i32]) -> Self;
     fn store(self, values: &mut [i32]);
+    /// The three low bytes of each lane, one lane's behind the other's, into the first 3 N
+    /// places of a slice; panics if there are fewer.
+    fn store_threes(self, bytes: &mut [u8]);
     /// The nearest f32.
     fn to_floats(self) -> Self::F;
     /// Each lane shifted by the other's lane, 0 to 31, with its sign.
@@ -142,9 +147,10 @@ pub(crate) trait Ints:
     /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
     /// lanes outside get 0. An index outside the table reads from its end.
     fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
-    /// For each lane in `mask` the elements `at` to `at + 3` of a table of at least four,
-    /// as pairs; as above.
-    fn gather_fours(table: &[u16], at: Self, mask: Self::M) -> (Self, Self);
+    /// For each lane in `mask` the elements `at` to `at + 3` of a table, as pairs, and those
+    /// `stride` elements on, and again, four times; lanes outside get 0. An index outside
+    /// the table reads from its end. Panics if the table has fewer than 3 `stride` + 4.
+    fn gather_rows(table: &[u16], at: Self, stride: usize, mask: Self::M) -> [(Self, Self); 4];
 }
 
 /// A yes or no a lane.

@@ -8,7 +8,7 @@ use crate::lanes;
 use crate::path::{Ground, Path};
 use crate::progress::{Progress, Stats};
 use crate::reference::Reference;
-use crate::shade::{Places, Shader, map_distance};
+use crate::shade::{At, Far, Places, Shader, map_distance};
 use std::collections::BTreeSet;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
@@ -156,7 +156,8 @@ impl<'a> Painter<'a> {
             channel.resize(self.s.len(), 0.0);
         }
         let [red, green, blue] = &mut self.light;
-        self.shader.shade(Places { x: &self.x, y: &self.y, s: &self.s }, [red, green, blue]);
+        let places = Places { at: At::Each(&self.x, &self.y), far: Far::Map(&self.s) };
+        self.shader.shade(places, [red, green, blue]);
         let count = (self.samples * self.samples) as usize;
         let share = 1.0 / count as f32;
         for (at, &[x, y]) in self.pixels.iter().enumerate() {

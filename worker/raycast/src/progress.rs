@@ -7,7 +7,7 @@ use crate::lanes;
 use crate::painter::Painter;
 use crate::pyramid::Pyramid;
 use crate::seen::Unfit;
-use crate::shade::{Places, Shader};
+use crate::shade::{At, Far, Places, Shader};
 use crate::srgb;
 use std::collections::BTreeSet;
 use terrafarm_common::quality::Quality;
@@ -15,6 +15,9 @@ use terrafarm_common::region::Region;
 use terrafarm_common::shading::LinearRgb;
 use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::Resident;
+
+/// Pixels that are shaded at once, about: their bytes stay close to the processor.
+const STRIP_PX: u32 = 4096;
 
 /// A region with its pixels.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -106,7 +109,7 @@ impl Progress {
         painter.finish(&mut self.stats, missing);
     }
 
-    /// Depths for all samples at once, then their light, row by row.
+    /// Depths for all samples at once, then their light, some rows at a time.
     fn paint_fast(
         &mut self,
         field: Field,
@@ -125,40 +128,19 @@ impl Progress {
         let hits = seen.inverse_depth.iter().filter(|&&inverse| inverse > 0.0).count();
         self.stats.hits += hits as u64;
         let mut shader = Shader::new(field, &view.camera, &view.shading, samples);
-        let columns = region.width as usize;
         let share = 1.0 / samples as f32;
         let middle = |sample: u32| (sample as f32 + 0.5) * share;
         let x: Vec<f32> = (region.x..region.x + region.width).map(middle).collect();
-        let mut light = [0, 1, 2].map(|_| vec![0.0; columns]);
-        let mut sums = vec![[0.0f32; 3]; self.region.width as usize];
-        let mut s = vec![0.0; columns];
-        for row in 0..region.height {
-            let depths = &seen.inverse_depth[row as usize * columns..][..columns];
-            fast::map_distances(&fine.camera, region, row, depths, &mut s);
-            let y = vec![middle(region.y + row); columns];
-            let [red, green, blue] = &mut light;
-            shader.shade(Places { x: &x, y: &y, s: &s }, [red, green, blue]);
-            if row % samples == 0 {
-                sums.fill([0.0; 3]);
-            }
-            for (sum, at) in sums.iter_mut().zip((0..).step_by(samples as usize)) {
-                for sample in at..at + samples as usize {
-                    for c in 0..3 {
-                        // A NaN stays one: `min` would lose it.
-                        let value = light[c][sample];
-                        sum[c] += if value > 1.0 { 1.0 } else { value };
-                    }
-                }
-            }
-            if row % samples == samples - 1 {
-                let weight = share * share;
-                let y = self.region.y + row / samples;
-                for (x, sum) in (self.region.x..).zip(&sums) {
-                    if !sum[0].is_nan() {
-                        self.paint(x, y, sum.map(|channel| channel * weight));
-                    }
-                }
-            }
+        let y: Vec<f32> = (region.y..region.y + region.height).map(middle).collect();
+        let mut strip = Strip::default();
+        let mut from = 0;
+        let rows = (STRIP_PX / region.width.max(1)).max(samples).next_multiple_of(samples) as usize;
+        let depths = seen.inverse_depth.chunks(rows * x.len().max(1));
+        for (depths, y) in depths.zip(y.chunks(rows)) {
+            let places = Places { at: At::Net(&x, y), far: Far::Inverse(depths) };
+            strip.shade(&mut shader, places, samples as usize);
+            self.take(from, &strip);
+            from += strip.pixels.len() / 3;
         }
         shader.wanted.drain_into(missing);
         Ok(())
@@ -192,11 +174,72 @@ impl Progress {
         self.done[at] = true;
     }
 
+    /// Takes the pixels of a strip, but for those that are unknown: from the one with the
+    /// number `from` on.
+    fn take(&mut self, from: usize, strip: &Strip) {
+        let mut start = 0;
+        let count = strip.pixels.len() / 3;
+        for &stop in strip.unknown.iter().chain([&count]) {
+            let known = from + start..from + stop;
+            self.pixels[3 * known.start..3 * known.end]
+                .copy_from_slice(&strip.pixels[3 * start..3 * stop]);
+            self.left -= self.done[known.clone()].iter().map(|&done| u64::from(!done)).sum::<u64>();
+            self.done[known].fill(true);
+            start = stop + 1;
+        }
+    }
+
     fn fill(&mut self, color: [u8; 3]) {
         for pixel in self.pixels.chunks_exact_mut(3) {
             pixel.copy_from_slice(&color);
         }
         self.done.fill(true);
         self.left = 0;
+    }
+}
+
+/// Some rows of pixels, shaded.
+#[derive(Default)]
+struct Strip {
+    /// Three bytes a pixel.
+    pixels: Vec<u8>,
+    /// Numbers of the pixels that wait for a tile, growing.
+    unknown: Vec<usize>,
+    /// Light of the samples, and its mean over a pixel: red, green and blue.
+    samples: [Vec<f32>; 3],
+    means: [Vec<f32>; 3],
+}
+
+impl Strip {
+    /// Shades pixels of so many samples a side; the places are a net of whole pixels.
+    fn shade(&mut self, shader: &mut Shader, places: Places, side: usize) {
+        let (At::Net(x, y) | At::Each(x, y)) = places.at;
+        let count = x.len() / side * (y.len() / side);
+        self.pixels.resize(3 * count, 0);
+        self.unknown.clear();
+        if side == 1 {
+            shader.paint(places, &mut self.pixels, &mut self.unknown);
+            return;
+        }
+        for light in &mut self.samples {
+            light.resize(x.len() * y.len(), 0.0);
+        }
+        let [red, green, blue] = &mut self.samples;
+        shader.shade(places, [red, green, blue]);
+        let weight = 1.0 / (side * side) as f32;
+        for (means, samples) in self.means.iter_mut().zip(&self.samples) {
+            means.clear();
+            for rows in samples.chunks(side * x.len()) {
+                means.extend((0..x.len()).step_by(side).map(|at| {
+                    let pixel = rows.chunks(x.len()).flat_map(|row| &row[at..at + side]);
+                    // A NaN stays one: `min` would lose it.
+                    pixel.map(|&light| if light > 1.0 { 1.0 } else { light }).sum::<f32>() * weight
+                }));
+            }
+        }
+        let [red, green, blue] = &self.means;
+        srgb::encode_all([red, green, blue], &mut self.pixels, lanes::widest());
+        let unknown = red.iter().enumerate().filter(|(_, light)| light.is_nan());
+        self.unknown.extend(unknown.map(|(number, _)| number));
     }
 }

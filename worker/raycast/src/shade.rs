@@ -28,10 +28,12 @@ use crate::field::{Field, Wanted};
 use crate::lanes::{self, Floats, Kernel, Lanes, MOST, Mask, Width};
 use crate::{Pyramid, View, srgb};
 use air::Air;
-use footprint::Footprint;
+use footprint::{Footprint, steepness};
 use glam::DVec3;
+use photo::{Rows, Sums};
 use ray::{Lens, Ray};
 use sheets::Sheets;
+use slope::Cells;
 use std::collections::BTreeSet;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -85,31 +87,48 @@ pub fn shade(
     pixels: &mut [u8],
 ) -> Vec<TileKey> {
     let mut shader = Shader::new(Field { resident, pyramid }, &view.camera, &view.shading, 1);
-    let columns = region.width as usize;
-    let x: Vec<f32> = (0..region.width).map(|x| (region.x + x) as f32 + 0.5).collect();
-    let mut light = [0, 1, 2].map(|_| vec![0.0; columns]);
-    for row in 0..region.height as usize {
-        let y = vec![(region.y as usize + row) as f32 + 0.5; columns];
-        let places = Places { x: &x, y: &y, s: &distances_m[row * columns..][..columns] };
-        let [red, green, blue] = &mut light;
-        shader.shade(places, [red, green, blue]);
-        let pixels = &mut pixels[3 * row * columns..][..3 * columns];
-        srgb::encode_all(light.each_ref().map(Vec::as_slice), pixels, shader.width);
-    }
+    let middle = |pixel: u32| pixel as f32 + 0.5;
+    let x: Vec<f32> = (region.x..region.x + region.width).map(middle).collect();
+    let y: Vec<f32> = (region.y..region.y + region.height).map(middle).collect();
+    let area = x.len() * y.len();
+    let far = Far::Map(&distances_m[..area]);
+    shader.paint(Places { at: At::Net(&x, &y), far }, &mut pixels[..3 * area], &mut Vec::new());
     let mut missing = BTreeSet::new();
     shader.wanted.drain_into(&mut missing);
     missing.into_iter().collect()
 }
 
-/// Places of the picture: pixels from its top left corner, and the map distance at which
-/// their rays meet the ground.
+/// Places of the picture, and how far away the ground is that is seen there.
 #[derive(Clone, Copy)]
 pub(crate) struct Places<'p> {
-    pub x: &'p [f32],
-    pub y: &'p [f32],
+    pub at: At<'p>,
+    pub far: Far<'p>,
+}
+
+/// Places of the picture, x and y, pixels from its top left corner.
+#[derive(Clone, Copy)]
+pub(crate) enum At<'p> {
+    /// One for each x, with the y of the same number.
+    Each(&'p [f32], &'p [f32]),
+    /// All of the columns at the first y, then all at the second, and so on.
+    Net(&'p [f32], &'p [f32]),
+}
+
+/// How far away the ground is.
+#[derive(Clone, Copy)]
+pub(crate) enum Far<'p> {
     /// Metres along the map; infinite for the sky, NaN where a tile is missing. The way of
     /// a ray that is steeper than one in a million counts as if it were that.
-    pub s: &'p [f32],
+    Map(&'p [f32]),
+    /// One over the depth, as [`crate::seen::Seen`] has it.
+    Inverse(&'p [f32]),
+}
+
+impl Far<'_> {
+    fn values(&self) -> &[f32] {
+        let (Far::Map(values) | Far::Inverse(values)) = self;
+        values
+    }
 }
 
 /// Sunlight on ground: `min(ambient + direct max(0, n.l), most)`.
@@ -159,7 +178,15 @@ impl<'a> Shader<'a> {
     /// hundred places at a time make good use of it; all slices have one length.
     pub(crate) fn shade(&mut self, places: Places, light: [&mut [f32]; 3]) {
         let width = self.width;
-        lanes::run(Run { shader: self, places, light }, width);
+        lanes::run(Run { shader: self, places, canvas: Canvas::Light(light) }, width);
+    }
+
+    /// The bytes of places, three each: black where a tile is missing. The numbers of those
+    /// places are added to `unknown`. As [`Shader::shade`], then [`srgb::encode_all`].
+    pub(crate) fn paint(&mut self, places: Places, pixels: &mut [u8], unknown: &mut Vec<usize>) {
+        let width = self.width;
+        let canvas = Canvas::Bytes(pixels, unknown);
+        lanes::run(Run { shader: self, places, canvas }, width);
     }
 
     /// Shades [`AT_ONCE`] places at most. Every step is done for all of them before the
@@ -171,11 +198,9 @@ impl<'a> Shader<'a> {
         for n in 0..vectors {
             self.rays::<L>(batch, n);
         }
-        for n in 0..vectors {
-            self.slopes::<L>(batch, n);
-        }
-        for n in 0..vectors {
-            self.photos::<L>(batch, n);
+        if batch.ground[..vectors].iter().any(|&ground| ground != 0) {
+            self.slopes::<L>(batch, vectors);
+            self.photos::<L>(batch, vectors);
         }
         for n in 0..vectors {
             self.colors::<L>(batch, n);
@@ -187,16 +212,18 @@ impl<'a> Shader<'a> {
     fn rays<L: Lanes>(&self, batch: &mut Batch, n: usize) {
         let at = n * L::N;
         let (x, y) = (L::F::load(&batch.x[at..]), L::F::load(&batch.y[at..]));
-        let s = L::F::load(&batch.s[at..]);
-        let ground = s.le(L::F::splat(f32::MAX));
-        batch.ground[n] = ground.bits();
-        batch.sky[n] = L::F::splat(f32::MAX).lt(s).bits();
+        let far = L::F::load(&batch.far[at..]);
         let ray = Ray::<L>::new(&self.lens, x, y);
+        let depth = if batch.inverse { ray.depth_of_inverse(far) } else { ray.depth_of_map(far) };
+        let ground = depth.le(L::F::splat(f32::MAX));
+        batch.ground[n] = ground.bits();
+        batch.sky[n] = L::F::splat(f32::MAX).lt(depth).bits();
+        batch.unsure[n] = 0;
         for part in 0..3 {
             ray.view[part].store(&mut batch.view[part][at..]);
         }
         if ground.any() {
-            let end = ray.end(&self.lens, L::F::select(ground, s, L::F::splat(1.0)));
+            let end = ray.end(&self.lens, L::F::select(ground, depth, L::F::splat(1.0)));
             end.along[0].store(&mut batch.along[0][at..]);
             end.along[1].store(&mut batch.along[1][at..]);
             end.over.store(&mut batch.over[at..]);
@@ -207,49 +234,84 @@ impl<'a> Shader<'a> {
         }
     }
 
-    /// Slopes of the ground.
+    /// Slopes of the ground: each place's by the uppermost layer that is there.
     #[inline(always)]
-    fn slopes<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
-        let at = n * L::N;
-        let ground = L::M::from_bits(batch.ground[n]);
-        if !ground.any() {
-            return;
+    fn slopes<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
+        batch.slopes = [[0.0; AT_ONCE]; 2];
+        let mut left = batch.ground;
+        for (number, sheets) in self.heights.iter_mut().enumerate().rev() {
+            for n in 0..vectors {
+                let at = n * L::N;
+                if left[n] == 0 {
+                    batch.cells.leave(n);
+                    continue;
+                }
+                let size = L::F::load(&batch.size[at..]);
+                let (along, lanes) = (batch.along::<L>(at), L::M::from_bits(left[n]));
+                batch.cells.lay::<L>(sheets, n, along, size, lanes, number == 0);
+                left[n] &= !batch.cells.lanes[n];
+            }
+            for is_coarser in [false, true] {
+                for n in 0..vectors {
+                    batch.cells.place::<L>(sheets, n, is_coarser);
+                }
+                for n in 0..vectors {
+                    let (slopes, wanted) = (&mut batch.slopes, &mut self.wanted);
+                    batch.cells.read::<L>(
+                        sheets,
+                        n,
+                        is_coarser,
+                        slopes,
+                        &mut batch.unsure[n],
+                        wanted,
+                    );
+                }
+            }
         }
-        let size = L::F::load(&batch.size[at..]);
-        let along = batch.along::<L>(at);
-        let found = slope::slopes::<L>(&mut self.heights, along, size, ground, &mut self.wanted);
-        found.slopes[0].store(&mut batch.slopes[0][at..]);
-        found.slopes[1].store(&mut batch.slopes[1][at..]);
-        batch.unsure[n] = found.unsure.bits();
     }
 
-    /// What the photos show, in sunlight.
+    /// What the photos show, from the topmost down.
     #[inline(always)]
-    fn photos<L: Lanes>(&mut self, batch: &mut Batch, n: usize) {
-        let at = n * L::N;
-        let ground = L::M::from_bits(batch.ground[n]);
-        if !ground.any() {
-            return;
+    fn photos<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
+        for n in 0..vectors {
+            let at = n * L::N;
+            steepness::<L>(batch.slopes::<L>(at)).store(&mut batch.steepness[at..]);
         }
-        let mut color = [L::F::splat(0.0); 3];
-        let mut covered = L::F::splat(0.0);
-        if !self.photos.is_empty() {
-            let size = L::F::load(&batch.size[at..]);
-            let sides = [self.lens.right, self.lens.up];
-            let [x, y, z] = batch.view::<L>(at);
-            let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
-            let slopes = batch.slopes::<L>(at);
-            let footprint = Footprint::<L>::new(sides, size, arriving, slopes);
-            let along = batch.along::<L>(at);
-            let wanted = &mut self.wanted;
-            let photo = photo::sample::<L>(&mut self.photos, along, &footprint, ground, wanted);
-            (color, covered) = (photo.light, photo.coverage);
-            batch.unsure[n] |= photo.unsure.bits();
+        batch.light = [[0.0; AT_ONCE]; 3];
+        batch.covered = [0.0; AT_ONCE];
+        let sides = [self.lens.right, self.lens.up];
+        for sheets in self.photos.iter_mut().rev() {
+            for n in 0..vectors {
+                let at = n * L::N;
+                if batch.ground[n] == 0 {
+                    batch.rows.leave(n);
+                    continue;
+                }
+                let size = L::F::load(&batch.size[at..]);
+                let [x, y, z] = batch.view::<L>(at);
+                let arriving = [x, y, z + L::F::load(&batch.falls[at..])];
+                let (slopes, steepness) =
+                    (batch.slopes::<L>(at), L::F::load(&batch.steepness[at..]));
+                let footprint = Footprint::<L>::new(sides, size, arriving, slopes, steepness);
+                let (along, ground) = (batch.along::<L>(at), L::M::from_bits(batch.ground[n]));
+                let covered = L::F::load(&batch.covered[at..]);
+                batch.rows.lay::<L>(sheets, n, along, &footprint, ground, covered);
+            }
+            for is_coarser in [false, true] {
+                for n in 0..vectors {
+                    batch.rows.place::<L>(sheets, n, is_coarser);
+                }
+                let mut sums = Sums {
+                    light: &mut batch.light,
+                    coverage: &mut batch.covered,
+                    unsure: &mut batch.unsure,
+                };
+                for n in 0..vectors {
+                    let wanted = &mut self.wanted;
+                    batch.rows.read::<L>(sheets, n, is_coarser, &mut sums, wanted);
+                }
+            }
         }
-        for c in 0..3 {
-            color[c].store(&mut batch.light[c][at..]);
-        }
-        covered.store(&mut batch.covered[at..]);
     }
 
     /// The light that comes in.
@@ -285,11 +347,7 @@ impl<'a> Shader<'a> {
     /// Photo, and tint where there is none, in sunlight.
     #[inline(always)]
     fn ground<L: Lanes>(&self, batch: &Batch, at: usize, over: L::F) -> [L::F; 3] {
-        let mut color = [
-            L::F::load(&batch.light[0][at..]),
-            L::F::load(&batch.light[1][at..]),
-            L::F::load(&batch.light[2][at..]),
-        ];
+        let mut color = photo::light::<L>(batch.light::<L>(at));
         let slopes = batch.slopes::<L>(at);
         let covered = L::F::load(&batch.covered[at..]);
         let open = covered.lt(L::F::splat(COVERED));
@@ -307,7 +365,7 @@ impl<'a> Shader<'a> {
             }
         }
         if let Some(sun) = &self.sun {
-            let light = sun.light::<L>(slopes);
+            let light = sun.light::<L>(slopes, L::F::load(&batch.steepness[at..]));
             for channel in &mut color {
                 *channel = *channel * light;
             }
@@ -326,7 +384,9 @@ struct Batch {
     count: usize,
     x: [f32; AT_ONCE],
     y: [f32; AT_ONCE],
-    s: [f32; AT_ONCE],
+    far: [f32; AT_ONCE],
+    /// It is one over the depth.
+    inverse: bool,
     ground: [u32; VECTORS],
     sky: [u32; VECTORS],
     unsure: [u32; VECTORS],
@@ -337,8 +397,11 @@ struct Batch {
     falls: [f32; AT_ONCE],
     size: [f32; AT_ONCE],
     slopes: [[f32; AT_ONCE]; 2],
+    steepness: [f32; AT_ONCE],
     light: [[f32; AT_ONCE]; 3],
     covered: [f32; AT_ONCE],
+    cells: Cells,
+    rows: Rows,
 }
 
 impl Batch {
@@ -348,7 +411,8 @@ impl Batch {
             count: 0,
             x: none,
             y: none,
-            s: none,
+            far: none,
+            inverse: false,
             ground: [0; VECTORS],
             sky: [0; VECTORS],
             unsure: [0; VECTORS],
@@ -359,8 +423,11 @@ impl Batch {
             falls: none,
             size: none,
             slopes: [none; 2],
+            steepness: none,
             light: [none; 3],
             covered: none,
+            cells: Cells::new(),
+            rows: Rows::new(),
         }
     }
 
@@ -368,13 +435,43 @@ impl Batch {
     /// need nothing.
     #[inline(always)]
     fn fill(&mut self, places: Places, at: usize) {
-        self.count = AT_ONCE.min(places.s.len() - at);
+        let far = places.far.values();
+        self.count = AT_ONCE.min(far.len() - at);
+        self.inverse = matches!(places.far, Far::Inverse(_));
         let end = at + self.count;
-        self.x[..self.count].copy_from_slice(&places.x[at..end]);
-        self.y[..self.count].copy_from_slice(&places.y[at..end]);
-        self.s[..self.count].copy_from_slice(&places.s[at..end]);
+        self.far[..self.count].copy_from_slice(&far[at..end]);
         let last = (self.count + MOST).min(AT_ONCE);
-        self.s[self.count..last].fill(f32::NAN);
+        self.far[self.count..last].fill(f32::NAN);
+        match places.at {
+            At::Each(x, y) => {
+                self.x[..self.count].copy_from_slice(&x[at..end]);
+                self.y[..self.count].copy_from_slice(&y[at..end]);
+            }
+            At::Net(x, y) => {
+                let mut filled = 0;
+                while filled < self.count {
+                    let (row, column) = ((at + filled) / x.len(), (at + filled) % x.len());
+                    let run = (x.len() - column).min(self.count - filled);
+                    self.x[filled..][..run].copy_from_slice(&x[column..][..run]);
+                    self.y[filled..][..run].fill(y[row]);
+                    filled += run;
+                }
+            }
+        }
+    }
+
+    /// The places of vector `n` of which it is not known what they show.
+    #[inline(always)]
+    fn unknown<L: Lanes>(&self, n: usize) -> u32 {
+        let filled = self.count - n * L::N;
+        let all = (1 << filled.min(L::N)) - 1;
+        all & !(self.sky[n] | (self.ground[n] & !self.unsure[n]))
+    }
+
+    #[inline(always)]
+    fn light<L: Lanes>(&self, at: usize) -> [L::F; 3] {
+        let [red, green, blue] = &self.light;
+        [L::F::load(&red[at..]), L::F::load(&green[at..]), L::F::load(&blue[at..])]
     }
 
     #[inline(always)]
@@ -394,11 +491,45 @@ impl Batch {
     }
 }
 
-/// A run of [`Shader::shade`].
+/// Where the light goes.
+enum Canvas<'p> {
+    /// Red, green and blue.
+    Light([&'p mut [f32]; 3]),
+    /// Three bytes a place, and the numbers of the places for which a tile is missing.
+    Bytes(&'p mut [u8], &'p mut Vec<usize>),
+}
+
+impl Canvas<'_> {
+    /// Takes the light of a batch, whose first place has the number `at`.
+    #[inline(always)]
+    fn take<L: Lanes>(&mut self, batch: &Batch, at: usize) {
+        let count = batch.count;
+        match self {
+            Canvas::Light(light) => {
+                for c in 0..3 {
+                    light[c][at..at + count].copy_from_slice(&batch.light[c][..count]);
+                }
+            }
+            Canvas::Bytes(pixels, unknown) => {
+                let pixels = &mut pixels[3 * at..3 * (at + count)];
+                for (n, pixels) in pixels.chunks_mut(3 * L::N).enumerate() {
+                    srgb::store::<L>(batch.light::<L>(n * L::N), pixels);
+                    let mut left = batch.unknown::<L>(n);
+                    while left != 0 {
+                        unknown.push(at + n * L::N + left.trailing_zeros() as usize);
+                        left &= left - 1;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A run of [`Shader::shade`] or [`Shader::paint`].
 struct Run<'s, 'a, 'p> {
     shader: &'s mut Shader<'a>,
     places: Places<'p>,
-    light: [&'p mut [f32]; 3],
+    canvas: Canvas<'p>,
 }
 
 impl Kernel for Run<'_, '_, '_> {
@@ -406,17 +537,14 @@ impl Kernel for Run<'_, '_, '_> {
 
     #[inline(always)]
     fn run<L: Lanes>(self) {
-        let Run { shader, places, light } = self;
+        let Run { shader, places, mut canvas } = self;
         let mut batch = Batch::new();
         let mut at = 0;
-        while at < places.s.len() {
+        while at < places.far.values().len() {
             batch.fill(places, at);
             shader.places::<L>(&mut batch);
-            let count = batch.count;
-            for c in 0..3 {
-                light[c][at..at + count].copy_from_slice(&batch.light[c][..count]);
-            }
-            at += count;
+            canvas.take::<L>(&batch, at);
+            at += batch.count;
         }
     }
 }
@@ -437,11 +565,10 @@ impl Sunlight {
 
     /// Light on ground of the given slopes; see the module's page.
     #[inline(always)]
-    fn light<L: Lanes>(&self, slopes: [L::F; 2]) -> L::F {
+    fn light<L: Lanes>(&self, slopes: [L::F; 2], steepness: L::F) -> L::F {
         let [x, y, z] = self.direction;
-        let steep = slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0);
         let facing = L::F::splat(z) - slopes[0] * L::F::splat(x) - slopes[1] * L::F::splat(y);
-        let facing = facing.max(L::F::splat(0.0)).div(steep.sqrt());
+        let facing = facing.max(L::F::splat(0.0)).div(steepness);
         let light = L::F::splat(self.ambient) + L::F::splat(self.direct) * facing;
         light.min(L::F::splat(self.most))
     }

@@ -6,6 +6,7 @@ use crate::tests_support::{Plan, mountains, store};
 use crate::{Pyramid, Unseen, depths};
 use glam::DVec3;
 use std::sync::Arc;
+use terrafarm_common::camera::Camera;
 use terrafarm_common::shading::Earth;
 use terrafarm_terrain::resident::Resident;
 

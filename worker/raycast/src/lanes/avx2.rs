@@ -159,6 +159,10 @@ impl Floats for F {
         }
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        F::lookup(table, at)
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         let (mut values, mut places) = ([0.0; 8], [0; 8]);
         self.store(&mut values);
@@ -189,6 +193,20 @@ impl Ints for I {
     fn store(self, values: &mut [i32]) {
         // SAFETY: see the page of this module.
         unsafe { _mm256_storeu_si256(values[..8].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        let bytes = &mut bytes[..24];
+        // SAFETY: see the page of this module; sixteen bytes and eight.
+        unsafe {
+            let order = _mm_setr_epi8(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1);
+            let dense = _mm256_shuffle_epi8(self.0, _mm256_broadcastsi128_si256(order));
+            let places = _mm256_setr_epi32(0, 1, 2, 4, 5, 6, 3, 7);
+            let dense = _mm256_permutevar8x32_epi32(dense, places);
+            _mm_storeu_si128(bytes.as_mut_ptr().cast(), _mm256_castsi256_si128(dense));
+            let rest = _mm256_extracti128_si256::<1>(dense);
+            _mm_storel_epi64(bytes[16..].as_mut_ptr().cast(), rest);
+        }
     }
     #[inline(always)]
     fn to_floats(self) -> F {
@@ -263,10 +281,20 @@ impl Ints for I {
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
-    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
-        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
-        // SAFETY: see the page of this module; element `last + 3` is inside the table.
-        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
+        let rest = table.len().min(i32::MAX as usize).checked_sub(3 * stride + 4);
+        let last = rest.expect("a table has four rows") as i32;
+        // SAFETY: see the page of this module; element `last + 3 * stride + 3` is inside the
+        // table.
+        unsafe {
+            let first = table.as_ptr();
+            [
+                gather_eights::<2>(first.cast(), at, last, mask),
+                gather_eights::<2>(first.add(stride).cast(), at, last, mask),
+                gather_eights::<2>(first.add(2 * stride).cast(), at, last, mask),
+                gather_eights::<2>(first.add(3 * stride).cast(), at, last, mask),
+            ]
+        }
     }
 }
 

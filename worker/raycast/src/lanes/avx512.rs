@@ -167,6 +167,11 @@ impl Floats for F {
         }
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_permutexvar_ps(at.0, _mm512_loadu_ps(table.as_ptr()))) }
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         let last = (table.len().min(i32::MAX as usize) - 1) as i32;
         // SAFETY: see the page of this module.
@@ -194,6 +199,20 @@ impl Ints for I {
     fn store(self, values: &mut [i32]) {
         // SAFETY: see the page of this module.
         unsafe { _mm512_storeu_si512(values[..16].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        let bytes = &mut bytes[..48];
+        // SAFETY: see the page of this module; thirty-two bytes and sixteen.
+        unsafe {
+            let order = _mm_setr_epi8(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1);
+            let dense = _mm512_shuffle_epi8(self.0, _mm512_broadcast_i32x4(order));
+            let places = _mm512_setr_epi32(0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, 3, 7, 11, 15);
+            let dense = _mm512_permutexvar_epi32(places, dense);
+            _mm256_storeu_si256(bytes.as_mut_ptr().cast(), _mm512_castsi512_si256(dense));
+            let rest = _mm512_extracti32x4_epi32::<2>(dense);
+            _mm_storeu_si128(bytes[32..].as_mut_ptr().cast(), rest);
+        }
     }
     #[inline(always)]
     fn to_floats(self) -> F {
@@ -256,10 +275,21 @@ impl Ints for I {
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
-    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
-        let last = (table.len().min(i32::MAX as usize) - 4) as i32;
-        // SAFETY: see the page of this module; element `last + 3` is inside the table.
-        unsafe { gather_eights::<2>(table.as_ptr().cast(), at, last, mask) }
+    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
+        let rest = table.len().min(i32::MAX as usize).checked_sub(3 * stride + 4);
+        let last = rest.expect("a table has four rows") as i32;
+        // SAFETY: see the page of this module; element `last + 3 * stride + 3` is inside the
+        // table.
+        unsafe {
+            let places = places(at, last);
+            let first: *const u8 = table.as_ptr().cast();
+            [
+                eights::<2>(first, &places, mask),
+                eights::<2>(first.add(2 * stride), &places, mask),
+                eights::<2>(first.add(4 * stride), &places, mask),
+                eights::<2>(first.add(6 * stride), &places, mask),
+            ]
+        }
     }
 }
 
@@ -273,17 +303,39 @@ impl Ints for I {
 #[inline(always)]
 unsafe fn gather_eights<const SIZE: usize>(table: *const u8, at: I, last: i32, mask: M) -> (I, I) {
     // SAFETY: by this function's own condition; every index is 0 to `last`.
+    unsafe { eights::<SIZE>(table, &places(at, last), mask) }
+}
+
+/// Indices, brought inside a table.
+///
+/// # Safety
+/// As every block here.
+#[inline(always)]
+unsafe fn places(at: I, last: i32) -> [u32; 16] {
+    let mut places = [0u32; 16];
+    // SAFETY: by this function's own condition.
     unsafe {
-        let mut places = [0u32; 16];
         let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
         _mm512_storeu_si512(places.as_mut_ptr().cast(), at);
+    }
+    places
+}
+
+/// Eight bytes a lane from places of a table; their low and high halves.
+///
+/// # Safety
+/// As every block here; and eight bytes from each place on must be readable.
+#[inline(always)]
+unsafe fn eights<const SIZE: usize>(table: *const u8, places: &[u32; 16], mask: M) -> (I, I) {
+    // SAFETY: by this function's own condition.
+    unsafe {
         let first = _mm512_inserti64x4::<1>(
-            _mm512_castsi256_si512(four_eights::<SIZE>(table, &places, 0)),
-            four_eights::<SIZE>(table, &places, 4),
+            _mm512_castsi256_si512(four_eights::<SIZE>(table, places, 0)),
+            four_eights::<SIZE>(table, places, 4),
         );
         let second = _mm512_inserti64x4::<1>(
-            _mm512_castsi256_si512(four_eights::<SIZE>(table, &places, 8)),
-            four_eights::<SIZE>(table, &places, 12),
+            _mm512_castsi256_si512(four_eights::<SIZE>(table, places, 8)),
+            four_eights::<SIZE>(table, places, 12),
         );
         let low = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
         let high = _mm512_add_epi32(low, _mm512_set1_epi32(1));

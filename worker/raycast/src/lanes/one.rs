@@ -135,6 +135,10 @@ impl Floats for F {
         F(table[..2][at.0 as usize & 1])
     }
     #[inline(always)]
+    fn pick(table: &[f32; 16], at: I) -> F {
+        F(table[at.0 as usize & 15])
+    }
+    #[inline(always)]
     fn scatter(self, table: &mut [f32], at: I, mask: M) {
         if mask.0 {
             let last = table.len() - 1;
@@ -157,6 +161,10 @@ impl Ints for I {
     #[inline(always)]
     fn store(self, values: &mut [i32]) {
         values[0] = self.0;
+    }
+    #[inline(always)]
+    fn store_threes(self, bytes: &mut [u8]) {
+        bytes[..3].copy_from_slice(&self.0.to_le_bytes()[..3]);
     }
     #[inline(always)]
     fn to_floats(self) -> F {
@@ -227,10 +235,16 @@ impl Ints for I {
         (I(table[at] as i32), I(table[at + 1] as i32))
     }
     #[inline(always)]
-    fn gather_fours(table: &[u16], at: I, mask: M) -> (I, I) {
-        let at = I((at.0 as u32 as usize).min(table.len() - 4) as i32);
-        let next = I(at.0 + 2);
-        (Self::gather_pairs(table, at, mask), Self::gather_pairs(table, next, mask))
+    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
+        let last = table.len().checked_sub(3 * stride + 4).expect("a table has four rows");
+        let at = (at.0 as u32 as usize).min(last);
+        let mut rows = [(I(0), I(0)); 4];
+        for (number, row) in rows.iter_mut().enumerate() {
+            let at = (at + number * stride) as i32;
+            let east = Self::gather_pairs(table, I(at + 2), mask);
+            *row = (Self::gather_pairs(table, I(at), mask), east);
+        }
+        rows
     }
 }
 

@@ -80,20 +80,19 @@ impl Air {
         let Some(haze) = &self.haze else { return ground };
         let mut depth = L::F::splat(-haze.extinction) * distance_m;
         if haze.thinning > 0.0 {
-            // The integral of exp(-h / H) along a line is its length times the mean of
-            // exp over the two ends' exponents, (1 - exp(-x)) / x for their difference x,
-            // or the like with the ends exchanged, so that x is not below zero.
-            let one = L::F::splat(1.0);
-            let zero = L::F::splat(0.0);
+            // The integral of exp(-h / H) along a line is its length times the mean of exp
+            // over the two ends' exponents: (1 - exp(-x)) / x for their difference x, by way
+            // of exp(-|x|), which cannot be too large.
+            let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
             let rise = over * L::F::splat(haze.thinning);
             let x = rise.abs();
             let fall = exp::<L>(-x);
-            let long = (one - fall).div(x);
+            let long = (one - fall).div(L::F::select(rise.lt(zero), x * fall, x));
             let series = one
-                - x * (L::F::splat(0.5)
-                    - x * (L::F::splat(1.0 / 6.0) - x * L::F::splat(1.0 / 24.0)));
-            let mean = L::F::select(x.lt(L::F::splat(FLAT_WAY)), series, long);
-            depth = depth * L::F::select(rise.lt(zero), mean.div(fall), mean);
+                - rise
+                    * (L::F::splat(0.5)
+                        - rise * (L::F::splat(1.0 / 6.0) - rise * L::F::splat(1.0 / 24.0)));
+            depth = depth * L::F::select(x.lt(L::F::splat(FLAT_WAY)), series, long);
         }
         let clear = exp::<L>(depth);
         let glow = self.glow::<L>(view);

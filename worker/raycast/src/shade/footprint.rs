@@ -28,18 +28,18 @@ pub(crate) struct Strip<L: Lanes> {
 
 impl<L: Lanes> Footprint<L> {
     /// Lays the sides of a pixel (unit vectors to its right and top, and their length)
-    /// along the unit vector `view` onto ground of the given slopes.
+    /// along the unit vector `view` onto ground of the given slopes, the length of whose
+    /// normal (-slopes, 1) is given.
     #[inline(always)]
     pub(crate) fn new(
         sides: [[f32; 3]; 2],
         length: L::F,
         view: [L::F; 3],
         slopes: [L::F; 2],
+        steepness: L::F,
     ) -> Self {
-        // The normal is (-slopes, 1).
-        let steep = (slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0)).sqrt();
         let facing = view[2] - view[0] * slopes[0] - view[1] * slopes[1];
-        let facing = facing.min(-steep * L::F::splat(1.0 / MAX_STRETCH));
+        let facing = facing.min(-steepness * L::F::splat(1.0 / MAX_STRETCH));
         let reach = length.div(facing);
         Footprint {
             sides: [
@@ -61,15 +61,25 @@ impl<L: Lanes> Footprint<L> {
         let (half_sum, half_difference) = ((xx + yy) * half, (xx - yy) * half);
         let root = (half_difference * half_difference + xy * xy).sqrt();
         // What is no number or too small to be one is round and of no size.
-        let square = (half_sum + root).max(L::F::splat(1e-20));
+        let least = L::F::splat(4e-19);
+        let root = root.max(least);
+        let square = (half_sum + root).max(least);
         let major = square.sqrt();
         let minor = (ax * by - ay * bx).abs().div(major);
-        // The eigenvector of the long axis, its larger part first.
-        let long = (half_difference.abs() + root).max(L::F::splat(1e-20));
-        let slant = xy.div(long);
-        let length = major.div((L::F::splat(1.0) + slant * slant).sqrt());
+        // The eigenvector of the long axis, its larger part first. The square of its cosine
+        // is long / (2 root).
+        let long = (half_difference.abs() + root).max(least + least);
+        let share = L::F::splat(1.0).div(root * long);
+        let slant = xy * root * share;
+        let length = major * (long * long * share * half).sqrt();
         Strip { along_x: L::F::splat(0.0).le(half_difference), length, slant, major, minor }
     }
+}
+
+/// Length of the normal (-slopes, 1).
+#[inline(always)]
+pub(crate) fn steepness<L: Lanes>(slopes: [L::F; 2]) -> L::F {
+    (slopes[0] * slopes[0] + slopes[1] * slopes[1] + L::F::splat(1.0)).sqrt()
 }
 
 /// One side on the ground.
@@ -100,7 +110,13 @@ mod tests {
     ) -> (bool, [f32; 4]) {
         let view = view.map(Floats::splat);
         let slopes = slopes.map(Floats::splat);
-        let footprint = Footprint::<One>::new(sides, Floats::splat(size), view, slopes);
+        let footprint = Footprint::<One>::new(
+            sides,
+            Floats::splat(size),
+            view,
+            slopes,
+            steepness::<One>(slopes),
+        );
         let strip = footprint.strip([1.0, 1.0]);
         let values = [strip.length, strip.slant, strip.major, strip.minor].map(|value| {
             let mut out = [0.0];

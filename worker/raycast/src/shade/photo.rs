@@ -8,11 +8,15 @@
 //! along: each counts by how much of it the footprint covers, and is interpolated across
 //! between two neighbours. A footprint one texel long thus is bilinear interpolation, and
 //! nothing jumps when it grows or moves.
+//!
+//! Some places are sampled at once, step by step: where a row lies follows from a long
+//! chain of roots and quotients, and reading it is a loop of a length that the processor
+//! cannot foresee. One after the other for each place, either would wait for the other.
 
 use super::footprint::{Footprint, Strip};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
-use super::slope::lerp;
+use super::{AT_ONCE, VECTORS};
 use crate::field::Wanted;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
 use terrafarm_terrain::layout::{TILE_POSTS, TILE_RING};
@@ -28,106 +32,353 @@ const OPAQUE: f32 = 0.999;
 /// How far beyond the centres of its outermost texels a photo reaches, in texels.
 const RIM: f32 = 0.5;
 
-/// Colour, premultiplied by coverage.
-pub(crate) struct Sample<L: Lanes> {
-    pub light: [L::F; 3],
-    pub coverage: L::F,
-    /// A tile was missing.
-    pub unsure: L::M,
+/// Places of a batch in one photo, and the rows of texels that they see in one of its
+/// levels. Masks are bits, one word a vector.
+pub(crate) struct Rows {
+    /// Those that see the photo, and of these the ones for which a tile was missing.
+    lanes: [u32; VECTORS],
+    cell: [[i32; AT_ONCE]; 2],
+    part: [[f32; AT_ONCE]; 2],
+    /// The strip.
+    along_x: [u32; VECTORS],
+    slant: [f32; AT_ONCE],
+    extent: [f32; AT_ONCE],
+    /// The finer level, the share of the coarser one, and what the photos above leave.
+    level: [i32; AT_ONCE],
+    coarser: [f32; AT_ONCE],
+    uncovered: [f32; AT_ONCE],
+    /// The rows that are to be read, and those of them that lie in one tile as a whole.
+    wanted: [u32; VECTORS],
+    inside: [u32; VECTORS],
+    /// Of the latter: the tile, the first texel in it were it not for the slant, and how
+    /// far across from there it is at the middle.
+    number: [i32; AT_ONCE],
+    first: [i32; AT_ONCE],
+    side: [f32; AT_ONCE],
+    /// See [`Track`].
+    begin: [f32; AT_ONCE],
+    start: [f32; AT_ONCE],
+    stop: [f32; AT_ONCE],
+    scale: [f32; AT_ONCE],
 }
 
-/// Colour and coverage at places so many metres east and north of the camera. `layers` are
-/// from the lowest to the topmost. Tiles that are not loaded are added to `wanted`.
-#[inline(always)]
-pub(crate) fn sample<L: Lanes>(
-    layers: &mut [Sheets<PhotoTile>],
-    along: [L::F; 2],
-    footprint: &Footprint<L>,
-    lanes: L::M,
-    wanted: &mut Wanted,
-) -> Sample<L> {
-    let zero = L::F::splat(0.0);
-    let mut sum: Sample<L> = Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
-    let mut number = layers.len();
-    while number > 0 {
-        number -= 1;
-        let sheets = &mut layers[number];
-        let (inside, spot) = sheets.spot::<L>(along, RIM);
-        let here = lanes & inside & sum.coverage.lt(L::F::splat(OPAQUE));
-        if !here.any() {
-            continue;
-        }
-        let strip: Strip<L> = footprint.strip(sheets.rate);
-        let below = filtered::<L>(sheets, &spot, &strip, here, wanted);
-        let uncovered = L::F::splat(1.0) - sum.coverage;
-        for c in 0..3 {
-            sum.light[c] = sum.light[c] + uncovered * below.light[c];
-        }
-        sum.coverage = sum.coverage + uncovered * below.coverage;
-        sum.unsure = sum.unsure | below.unsure;
-    }
-    sum
+/// What is summed up over the photos: light in squares of the texels' steps, premultiplied
+/// by coverage; see [`light`].
+pub(crate) struct Sums<'b> {
+    pub light: &'b mut [[f32; AT_ONCE]; 3],
+    pub coverage: &'b mut [f32; AT_ONCE],
+    /// Places for which a tile was missing.
+    pub unsure: &'b mut [u32; VECTORS],
 }
 
-/// The mean over a footprint, blended from the two levels whose texels are at most as
-/// wide as it, and at least.
+/// Light, 0 to 1, of a sum.
 #[inline(always)]
-fn filtered<L: Lanes>(
-    sheets: &mut Sheets<PhotoTile>,
-    spot: &Spot<L>,
-    strip: &Strip<L>,
-    lanes: L::M,
-    wanted: &mut Wanted,
-) -> Sample<L> {
-    let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-    let width = strip.minor.max(strip.major * L::F::splat(1.0 / MAX_STRETCH));
-    let between = Between::<L>::of(width, sheets.top());
-    let mut sum: Sample<L> = Sample { light: [zero; 3], coverage: zero, unsure: L::M::none() };
-    let mut pass = 0;
-    while pass < 2 {
-        let share = if pass == 0 { one - between.share } else { between.share };
-        let level = between.level + L::I::splat(pass);
-        let mut left = lanes & zero.lt(share);
-        while left.any() {
-            let here_level = first::<L>(level, left);
-            let here = left & level.eq(L::I::splat(here_level));
-            left = left & !here;
-            let splat = L::I::splat(here_level);
-            let row = Row::<L>::new(spot, strip, splat);
-            mean::<L>(sheets, here_level, &row, share, here, &mut sum, wanted);
-        }
-        pass += 1;
-    }
+pub(crate) fn light<L: Lanes>(sum: [L::F; 3]) -> [L::F; 3] {
+    let mut light = sum;
     for c in 0..3 {
-        let most = 1.0 / (FIELDS[c] as f32);
-        sum.light[c] = sum.light[c] * L::F::splat(most * most);
+        let most = 1.0 / FIELDS[c] as f32;
+        light[c] = sum[c] * L::F::splat(most * most);
     }
-    sum
+    light
+}
+
+impl Rows {
+    pub(crate) fn new() -> Self {
+        let (none, zero) = ([0.0; AT_ONCE], [0; AT_ONCE]);
+        Rows {
+            lanes: [0; VECTORS],
+            cell: [zero; 2],
+            part: [none; 2],
+            along_x: [0; VECTORS],
+            slant: none,
+            extent: none,
+            level: zero,
+            coarser: none,
+            uncovered: none,
+            wanted: [0; VECTORS],
+            inside: [0; VECTORS],
+            number: zero,
+            first: zero,
+            side: none,
+            begin: none,
+            start: none,
+            stop: none,
+            scale: none,
+        }
+    }
+
+    /// Lays the footprints of vector `n`, at places so many metres east and north of the
+    /// camera, on a photo. Those that it or the photos above do not show are left out.
+    #[inline(always)]
+    pub(crate) fn lay<L: Lanes>(
+        &mut self,
+        sheets: &Sheets<PhotoTile>,
+        n: usize,
+        along: [L::F; 2],
+        footprint: &Footprint<L>,
+        lanes: L::M,
+        covered: L::F,
+    ) {
+        let at = n * L::N;
+        let (inside, spot) = sheets.spot::<L>(along, RIM);
+        let here = lanes & inside & covered.lt(L::F::splat(OPAQUE));
+        self.lanes[n] = here.bits();
+        let strip: Strip<L> = footprint.strip(sheets.rate);
+        let width = strip.minor.max(strip.major * L::F::splat(1.0 / MAX_STRETCH));
+        let between = Between::<L>::of(width, sheets.top());
+        for axis in 0..2 {
+            spot.cell[axis].store(&mut self.cell[axis][at..]);
+            spot.part[axis].store(&mut self.part[axis][at..]);
+        }
+        self.along_x[n] = strip.along_x.bits();
+        strip.slant.store(&mut self.slant[at..]);
+        strip.length.store(&mut self.extent[at..]);
+        between.level.store(&mut self.level[at..]);
+        between.share.store(&mut self.coarser[at..]);
+        (L::F::splat(1.0) - covered).store(&mut self.uncovered[at..]);
+    }
+
+    /// No place of vector `n` sees anything.
+    #[inline(always)]
+    pub(crate) fn leave(&mut self, n: usize) {
+        self.lanes[n] = 0;
+    }
+
+    /// Finds the rows of vector `n` in the finer level, or in the coarser one.
+    #[inline(always)]
+    pub(crate) fn place<L: Lanes>(
+        &mut self,
+        sheets: &Sheets<PhotoTile>,
+        n: usize,
+        is_coarser: bool,
+    ) {
+        let at = n * L::N;
+        let share = self.share::<L>(at, is_coarser);
+        let wanted = L::M::from_bits(self.lanes[n]) & L::F::splat(0.0).lt(share);
+        self.wanted[n] = wanted.bits();
+        self.inside[n] = 0;
+        if !wanted.any() {
+            return;
+        }
+        let level = self.level::<L>(at, is_coarser);
+        let mut grid: Grid<L> = Grid::of(sheets.sheet(first::<L>(level, wanted)));
+        let mut left = wanted & !level.eq(L::I::splat(first::<L>(level, wanted)));
+        while left.any() {
+            let other = first::<L>(level, left);
+            let here = left & level.eq(L::I::splat(other));
+            grid = grid.or(here, Grid::of(sheets.sheet(other)));
+            left = left & !here;
+        }
+        let row = self.row::<L>(n, level);
+        let track = Track::new(&row, &grid, share);
+        let none = L::I::splat(0);
+        let bits = L::I::splat(TILE_BITS);
+        let (begin, end) = (track.start.floor(), track.stop.floor());
+        let (low, high) = (row.cell[0] + begin, row.cell[0] + end);
+        let (one_end, _) = row.across(begin.to_floats());
+        let (other_end, _) = row.across(end.to_floats());
+        let (near, far) = (one_end.min(other_end), one_end.max(other_end));
+        let (near, far) = (row.cell[1] + near, row.cell[1] + far);
+        let (along, across) = (low.shr(bits), near.shr(bits));
+        let outside = low.lt(none)
+            | track.end[0].lt(high)
+            | near.lt(none)
+            | !far.lt(track.end[1])
+            | track.last[0].lt(along)
+            | track.last[1].lt(across);
+        let inside = !outside & along.eq(high.shr(bits)) & across.eq(far.shr(bits));
+        self.inside[n] = (wanted & inside).bits();
+        let tx = L::I::select(row.along_x, along, across);
+        let ty = L::I::select(row.along_x, across, along);
+        let number = ty.times(grid.last[0] + L::I::splat(1)) + tx;
+        // From a texel of the middle's cell in the tile.
+        let wide = L::I::splat(TILE_POSTS as i32);
+        let corner = (low - along.shl(bits)).times(wide) + track.copy;
+        number.store(&mut self.number[at..]);
+        (corner + row.cell[1] - across.shl(bits)).store(&mut self.first[at..]);
+        row.side.store(&mut self.side[at..]);
+        begin.to_floats().store(&mut self.begin[at..]);
+        track.start.store(&mut self.start[at..]);
+        track.stop.store(&mut self.stop[at..]);
+        track.scale.store(&mut self.scale[at..]);
+    }
+
+    /// Adds the means of the rows of vector `n` that [`Rows::place`] has found to the sums.
+    /// Tiles that are not loaded are added to `missing`.
+    #[inline(always)]
+    pub(crate) fn read<L: Lanes>(
+        &self,
+        sheets: &mut Sheets<PhotoTile>,
+        n: usize,
+        is_coarser: bool,
+        sums: &mut Sums,
+        missing: &mut Wanted,
+    ) {
+        if self.wanted[n] == 0 {
+            return;
+        }
+        let at = n * L::N;
+        let [red, green, blue] = &*sums.light;
+        let mut sum: Sum<L> = Sum {
+            light: [L::F::load(&red[at..]), L::F::load(&green[at..]), L::F::load(&blue[at..])],
+            coverage: L::F::load(&sums.coverage[at..]),
+            unsure: L::M::from_bits(sums.unsure[n]),
+        };
+        self.inner::<L>(sheets, n, is_coarser, &mut sum, missing);
+        let mut rest = L::M::from_bits(self.wanted[n] & !self.inside[n]);
+        let level = self.level::<L>(at, is_coarser);
+        while rest.any() {
+            let known = first::<L>(level, rest);
+            let here = rest & level.eq(L::I::splat(known));
+            rest = rest & !here;
+            let row = self.row::<L>(n, level);
+            let grid = Grid::of(sheets.sheet(known));
+            let track = Track::new(&row, &grid, self.share::<L>(at, is_coarser));
+            outer::<L>(sheets, known, &row, &track, here, &mut sum, missing);
+        }
+        for c in 0..3 {
+            sum.light[c].store(&mut sums.light[c][at..]);
+        }
+        sum.coverage.store(&mut sums.coverage[at..]);
+        sums.unsure[n] = sum.unsure.bits();
+    }
+
+    /// Those rows that lie in one tile as a whole.
+    #[inline(always)]
+    fn inner<L: Lanes>(
+        &self,
+        sheets: &mut Sheets<PhotoTile>,
+        n: usize,
+        is_coarser: bool,
+        sum: &mut Sum<L>,
+        missing: &mut Wanted,
+    ) {
+        let at = n * L::N;
+        let wide = L::I::splat(TILE_POSTS as i32);
+        let (level, number) = (self.level::<L>(at, is_coarser), L::I::load(&self.number[at..]));
+        let mut left = L::M::from_bits(self.inside[n]);
+        while left.any() {
+            let (known_level, known) = (first::<L>(level, left), first::<L>(number, left));
+            let here = left & level.eq(L::I::splat(known_level)) & number.eq(L::I::splat(known));
+            left = left & !here;
+            let texels = match sheets.tile(known_level, known, missing) {
+                Soil::Tile(tile) => tile.texels(),
+                Soil::Empty => continue,
+                Soil::Absent => {
+                    sum.unsure = sum.unsure | here;
+                    continue;
+                }
+            };
+            let zero = L::F::splat(0.0);
+            let (side, slant) = (L::F::load(&self.side[at..]), L::F::load(&self.slant[at..]));
+            let (start, stop) = (L::F::load(&self.start[at..]), L::F::load(&self.stop[at..]));
+            let scale = L::F::select(here, L::F::load(&self.scale[at..]), zero);
+            let mut texel = L::I::load(&self.first[at..]);
+            let mut step = L::F::load(&self.begin[at..]);
+            let mut going = here;
+            while going.any() {
+                // A row has two texels at least.
+                for _ in 0..2 {
+                    let across = side + step * slant;
+                    let floor = across.floor();
+                    let part = across - floor.to_floats();
+                    let weight = weight::<L>(step, start, stop).max(zero) * scale;
+                    add::<L>(texels, texel + floor, part, weight, here, sum);
+                    step = step + L::F::splat(1.0);
+                    texel = texel + wide;
+                }
+                going = going & step.lt(stop);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn level<L: Lanes>(&self, at: usize, is_coarser: bool) -> L::I {
+        L::I::load(&self.level[at..]) + L::I::splat(i32::from(is_coarser))
+    }
+
+    /// The share of a level in the sums.
+    #[inline(always)]
+    fn share<L: Lanes>(&self, at: usize, is_coarser: bool) -> L::F {
+        let coarser = L::F::load(&self.coarser[at..]);
+        let share = if is_coarser { coarser } else { L::F::splat(1.0) - coarser };
+        share * L::F::load(&self.uncovered[at..])
+    }
+
+    /// The strips of vector `n` in a level.
+    #[inline(always)]
+    fn row<L: Lanes>(&self, n: usize, level: L::I) -> Row<L> {
+        let at = n * L::N;
+        let [i, j] = &self.cell;
+        let [x, y] = &self.part;
+        let spot: Spot<L> = Spot {
+            cell: [L::I::load(&i[at..]), L::I::load(&j[at..])],
+            part: [L::F::load(&x[at..]), L::F::load(&y[at..])],
+        };
+        let Spot { cell: [i, j], part: [x, y] } = spot.at_level(level);
+        let along_x = L::M::from_bits(self.along_x[n]);
+        let extent = L::F::load(&self.extent[at..]) * shrink::<L>(level);
+        let slant = L::F::load(&self.slant[at..]);
+        let middle = L::F::select(along_x, x, y);
+        Row {
+            along_x,
+            cell: [L::I::select(along_x, i, j), L::I::select(along_x, j, i)],
+            middle,
+            side: L::F::select(along_x, y, x) - middle * slant,
+            slant,
+            length: extent.max(L::F::splat(1.0)).min(L::F::splat(LONGEST)),
+        }
+    }
+}
+
+/// A vector of [`Sums`].
+struct Sum<L: Lanes> {
+    light: [L::F; 3],
+    coverage: L::F,
+    unsure: L::M,
 }
 
 /// A strip in a level.
 struct Row<L: Lanes> {
     along_x: L::M,
-    /// The middle: the texel, and how far from it, along the row and across.
+    /// The middle's texel along the row and across, and how far along from it the middle is.
     cell: [L::I; 2],
-    part: [L::F; 2],
+    middle: L::F,
+    /// How far across from that texel the row is beside it.
+    side: L::F,
     slant: L::F,
     /// In texels of the level, 1 at least.
     length: L::F,
 }
 
-impl<L: Lanes> Row<L> {
+/// The sizes of levels along x and y: last post and last tile.
+struct Grid<L: Lanes> {
+    end: [L::I; 2],
+    last: [L::I; 2],
+}
+
+impl<L: Lanes> Grid<L> {
     #[inline(always)]
-    fn new(spot: &Spot<L>, strip: &Strip<L>, level: L::I) -> Self {
-        let Spot { cell: [i, j], part: [x, y] } = spot.at_level(level);
-        let along_x = strip.along_x;
-        let length = (strip.length * shrink::<L>(level)).max(L::F::splat(1.0));
-        Row {
-            along_x,
-            cell: [L::I::select(along_x, i, j), L::I::select(along_x, j, i)],
-            part: [L::F::select(along_x, x, y), L::F::select(along_x, y, x)],
-            slant: strip.slant,
-            length: length.min(L::F::splat(LONGEST)),
+    fn of(sheet: Sheet) -> Self {
+        let Sheet { end, last_tile } = sheet;
+        Grid {
+            end: [L::I::splat(end[0]), L::I::splat(end[1])],
+            last: [L::I::splat(last_tile[0]), L::I::splat(last_tile[1])],
+        }
+    }
+
+    #[inline(always)]
+    fn or(self, lanes: L::M, other: Grid<L>) -> Self {
+        let (end, last) = (other.end, other.last);
+        Grid {
+            end: [
+                L::I::select(lanes, end[0], self.end[0]),
+                L::I::select(lanes, end[1], self.end[1]),
+            ],
+            last: [
+                L::I::select(lanes, last[0], self.last[0]),
+                L::I::select(lanes, last[1], self.last[1]),
+            ],
         }
     }
 }
@@ -147,101 +398,24 @@ struct Track<L: Lanes> {
     scale: L::F,
 }
 
-/// Adds the mean of the texels of a row to `sum`, by its share.
-#[inline(always)]
-fn mean<L: Lanes>(
-    sheets: &mut Sheets<PhotoTile>,
-    level: i32,
-    row: &Row<L>,
-    share: L::F,
-    lanes: L::M,
-    sum: &mut Sample<L>,
-    wanted: &mut Wanted,
-) {
-    let sheet = sheets.sheet(level);
-    let along_x = row.along_x;
-    let (x_end, y_end) = (L::I::splat(sheet.end[0]), L::I::splat(sheet.end[1]));
-    let (x_last, y_last) = (L::I::splat(sheet.last_tile[0]), L::I::splat(sheet.last_tile[1]));
-    let ring = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING) as i32);
-    let turned = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING + TURNED) as i32);
-    let reach = row.length * L::F::splat(0.5);
-    let middle = row.part[0] + L::F::splat(0.5);
-    let track: Track<L> = Track {
-        end: [L::I::select(along_x, x_end, y_end), L::I::select(along_x, y_end, x_end)],
-        last: [L::I::select(along_x, x_last, y_last), L::I::select(along_x, y_last, x_last)],
-        copy: L::I::select(along_x, turned, ring),
-        start: middle - reach,
-        stop: middle + reach,
-        scale: share.div(row.length),
-    };
-    let rest = inner::<L>(sheets, level, row, &track, lanes, sum, wanted);
-    if rest.any() {
-        outer::<L>(sheets, level, row, &track, rest, sum, wanted);
-    }
-}
-
-/// Those rows that lie in one tile as a whole. Returns the lanes whose rows do not.
-#[inline(always)]
-fn inner<L: Lanes>(
-    sheets: &mut Sheets<PhotoTile>,
-    level: i32,
-    row: &Row<L>,
-    track: &Track<L>,
-    lanes: L::M,
-    sum: &mut Sample<L>,
-    wanted: &mut Wanted,
-) -> L::M {
-    let none = L::I::splat(0);
-    let bits = L::I::splat(TILE_BITS);
-    let start = track.start.floor();
-    let stop = track.stop.floor();
-    let (low, high) = (row.cell[0] + start, row.cell[0] + stop);
-    let (one_end, _) = row.across(start.to_floats());
-    let (other_end, _) = row.across(stop.to_floats());
-    let (left, right) = (one_end.min(other_end), one_end.max(other_end));
-    let (along, across) = (low.shr(bits), left.shr(bits));
-    let outside = low.lt(none)
-        | track.end[0].lt(high)
-        | left.lt(none)
-        | !right.lt(track.end[1])
-        | track.last[0].lt(along)
-        | track.last[1].lt(across);
-    let inside = !outside & along.eq(high.shr(bits)) & across.eq(right.shr(bits));
-    let tx = L::I::select(row.along_x, along, across);
-    let ty = L::I::select(row.along_x, across, along);
-    let number = sheets.sheet(level).number::<L>(tx, ty);
-    // From a texel of the middle's cell in the tile.
-    let wide = L::I::splat(TILE_POSTS as i32);
-    let corner = (row.cell[0] - along.shl(bits)).times(wide) + track.copy - across.shl(bits);
-    let mut left = lanes & inside;
-    while left.any() {
-        let known = first::<L>(number, left);
-        let here = left & number.eq(L::I::splat(known));
-        left = left & !here;
-        let texels = match sheets.tile(level, known, wanted) {
-            Soil::Tile(tile) => tile.texels(),
-            Soil::Empty => continue,
-            Soil::Absent => {
-                sum.unsure = sum.unsure | here;
-                continue;
-            }
-        };
-        let mut at = corner + start.times(wide);
-        let mut step = start.to_floats();
-        let mut going = here;
-        while going.any() {
-            // A row has two texels at least.
-            for _ in 0..2 {
-                let (other, part) = row.across(step);
-                let weight = track.weight(step).max(L::F::splat(0.0));
-                add::<L>(texels, at + other, part, weight, going, sum);
-                step = step + L::F::splat(1.0);
-                at = at + wide;
-            }
-            going = going & step.lt(track.stop);
+impl<L: Lanes> Track<L> {
+    #[inline(always)]
+    fn new(row: &Row<L>, grid: &Grid<L>, share: L::F) -> Self {
+        let along_x = row.along_x;
+        let ring = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING) as i32);
+        let turned = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING + TURNED) as i32);
+        let reach = row.length * L::F::splat(0.5);
+        let middle = row.middle + L::F::splat(0.5);
+        let ([x_end, y_end], [x_last, y_last]) = (grid.end, grid.last);
+        Track {
+            end: [L::I::select(along_x, x_end, y_end), L::I::select(along_x, y_end, x_end)],
+            last: [L::I::select(along_x, x_last, y_last), L::I::select(along_x, y_last, x_last)],
+            copy: L::I::select(along_x, turned, ring),
+            start: middle - reach,
+            stop: middle + reach,
+            scale: share.div(row.length),
         }
     }
-    lanes & !inside
 }
 
 /// Rows texel by texel, from tile to tile. Beside the layer its outermost texels go on.
@@ -252,7 +426,7 @@ fn outer<L: Lanes>(
     row: &Row<L>,
     track: &Track<L>,
     lanes: L::M,
-    sum: &mut Sample<L>,
+    sum: &mut Sum<L>,
     wanted: &mut Wanted,
 ) {
     let (zero, none) = (L::F::splat(0.0), L::I::splat(0));
@@ -265,6 +439,7 @@ fn outer<L: Lanes>(
         let step = texel.to_floats();
         let post = (row.cell[0] + texel).max(none).min(track.end[0]);
         let (other, part) = row.across(step);
+        let other = row.cell[1] + other;
         let part = L::F::select(other.lt(none), zero, part);
         let part = L::F::select(other.lt(track.end[1]), part, zero);
         let other = other.max(none).min(track.end[1]);
@@ -288,7 +463,9 @@ fn outer<L: Lanes>(
         }
         if let Some(texels) = tile {
             let at = along.times(L::I::splat(TILE_POSTS as i32)) + across + track.copy;
-            add::<L>(texels, at, part, track.weight(step), here, sum);
+            let weight = weight::<L>(step, track.start, track.stop) * track.scale;
+            let weight = L::F::select(here, weight, zero);
+            add::<L>(texels, at, part, weight, here, sum);
         }
         texel = L::I::select(here, texel + L::I::splat(1), texel);
         left = left & (!here | texel.to_floats().lt(track.stop));
@@ -296,26 +473,25 @@ fn outer<L: Lanes>(
 }
 
 impl<L: Lanes> Row<L> {
-    /// The texel across from one along the row, and how far it is to the next: both
-    /// relative to the middle's.
+    /// How far across a row is beside a texel along it, from the middle's: the texel, and
+    /// the way from there to the next.
     #[inline(always)]
     fn across(&self, step: L::F) -> (L::I, L::F) {
-        let side = self.part[1] + (step - self.part[0]) * self.slant;
+        let side = self.side + step * self.slant;
         let floor = side.floor();
-        (self.cell[1] + floor, side - floor.to_floats())
+        (floor, side - floor.to_floats())
     }
 }
 
-impl<L: Lanes> Track<L> {
-    /// Weight of a texel of the row.
-    #[inline(always)]
-    fn weight(&self, step: L::F) -> L::F {
-        let one = L::F::splat(1.0);
-        (self.stop - step).min(step + one - self.start).min(one) * self.scale
-    }
+/// How much of a texel a row covers: below zero beside the row.
+#[inline(always)]
+fn weight<L: Lanes>(step: L::F, start: L::F, stop: L::F) -> L::F {
+    let one = L::F::splat(1.0);
+    (stop - step).min(step + one - start).min(one)
 }
 
-/// Adds a texel, blended with the next one, to `sum`.
+/// Adds a texel, blended with the next one, to `sum`. The weight of lanes not in `lanes`
+/// is 0.
 #[inline(always)]
 fn add<L: Lanes>(
     texels: Texels,
@@ -323,23 +499,22 @@ fn add<L: Lanes>(
     part: L::F,
     weight: L::F,
     lanes: L::M,
-    sum: &mut Sample<L>,
+    sum: &mut Sum<L>,
 ) {
-    let weight = L::F::select(lanes, weight, L::F::splat(0.0));
     let (a, b) = L::I::gather_twos(texels.light, at, lanes);
+    let of_b = part * weight;
+    let of_a = weight - of_b;
     for c in 0..3 {
         let field = L::I::splat(FIELDS[c] as i32);
         let (a, b) = ((a & field).to_floats(), (b & field).to_floats());
-        sum.light[c] = sum.light[c] + lerp::<L>(a * a, b * b, part) * weight;
+        sum.light[c] = sum.light[c] + (a * a * of_a + b * b * of_b);
     }
-    let covered = match texels.coverage {
-        None => L::F::splat(1.0),
-        Some(coverage) => {
-            let pair = L::I::gather_pairs(coverage, at, lanes);
-            let low = L::I::splat(0xFFFF);
-            let (a, b) = (pair & low, pair.shr(L::I::splat(16)) & low);
-            lerp::<L>(a.to_floats(), b.to_floats(), part) * L::F::splat(1.0 / 65535.0)
-        }
+    let Some(coverage) = texels.coverage else {
+        sum.coverage = sum.coverage + weight;
+        return;
     };
-    sum.coverage = sum.coverage + covered * weight;
+    let pair = L::I::gather_pairs(coverage, at, lanes);
+    let low = L::I::splat(0xFFFF);
+    let (a, b) = ((pair & low).to_floats(), (pair.shr(L::I::splat(16)) & low).to_floats());
+    sum.coverage = sum.coverage + (a * of_a + b * of_b) * L::F::splat(1.0 / 65535.0);
 }

@@ -36,11 +36,12 @@ pub(crate) struct Lens {
 /// Rays: unit vectors along which they set out.
 pub(crate) struct Ray<L: Lanes> {
     pub view: [L::F; 3],
-    /// 1 / length of a ray whose part along the camera's axis is 1.
+    /// Their directions where the part along the camera's axis is 1: the length, 1 / length,
+    /// and the square of the length along the map.
+    direction: [L::F; 3],
+    length: L::F,
     shortening: L::F,
-    /// Direction on the map, and length of `view` along it.
-    heading: [L::F; 2],
-    level: L::F,
+    across: L::F,
 }
 
 /// Where rays end.
@@ -87,43 +88,53 @@ impl<L: Lanes> Ray<L> {
             let sideways = L::F::splat(lens.across[n]) * x + L::F::splat(lens.down[n]) * y;
             view[n] = L::F::splat(lens.forward[n]) + sideways;
         }
-        let one = L::F::splat(1.0);
-        let level = view[0] * view[0] + view[1] * view[1];
-        let shortening = one.div((level + view[2] * view[2]).sqrt());
+        let direction = view;
+        let across = view[0] * view[0] + view[1] * view[1];
+        let length = (across + view[2] * view[2]).sqrt();
+        let shortening = L::F::splat(1.0).div(length);
         for part in &mut view {
             *part = *part * shortening;
         }
-        let level = view[0] * view[0] + view[1] * view[1];
-        let level = level.sqrt().max(L::F::splat(STEEPEST as f32));
-        let inverse = one.div(level);
-        let heading = [view[0] * inverse, view[1] * inverse];
-        Ray { view, shortening, heading, level }
+        Ray { view, direction, length, shortening, across }
     }
 
-    /// Their ends at a map distance.
+    /// The part along the camera's axis of the way to a map distance; the ways here are as
+    /// long as if the ground were flat.
     #[inline(always)]
-    pub(crate) fn end(&self, lens: &Lens, s: L::F) -> End<L> {
-        let along = [self.heading[0] * s, self.heading[1] * s];
-        let z = self.view[2];
+    pub(crate) fn depth_of_map(&self, s: L::F) -> L::F {
+        let least = self.length * L::F::splat(STEEPEST as f32);
+        s.div(self.across.sqrt().max(least))
+    }
+
+    /// The same to where one over it is known.
+    #[inline(always)]
+    pub(crate) fn depth_of_inverse(&self, inverse: L::F) -> L::F {
+        L::F::splat(1.0).div(inverse)
+    }
+
+    /// Their ends at such a depth.
+    #[inline(always)]
+    pub(crate) fn end(&self, lens: &Lens, depth: L::F) -> End<L> {
+        let [x, y, z] = self.direction;
+        let along = [x * depth, y * depth];
+        let straight = z * depth;
+        let way = depth * self.length;
         if lens.curvature == 0.0 {
-            let distance = s.div(self.level);
-            let depth = distance * self.shortening;
-            return End { along, over: z * distance, distance, depth, falls: L::F::splat(0.0) };
+            let falls = L::F::splat(0.0);
+            return End { along, over: straight, distance: way, depth, falls };
         }
         let one = L::F::splat(1.0);
         let k = L::F::splat(lens.curvature);
-        let phi = s * k;
-        let square = phi * phi;
-        let straight = s.div(self.level) * z;
+        // The square of the way along the map, over the radius: s phi.
+        let bent = self.across * depth * depth * k;
+        let square = bent * k;
         let lift = straight * (one - square * L::F::splat(1.0 / 6.0))
-            + s * phi * (L::F::splat(0.5) - square * L::F::splat(1.0 / 24.0));
+            + bent * (L::F::splat(0.5) - square * L::F::splat(1.0 / 24.0));
         let grown = L::F::splat(lens.grown);
         let over = (grown * lift).div(one - k * lift);
-        // The chord between two points of heights z0 and z, an arc of phi apart.
-        let chord = s * s * grown * (grown + k * over);
-        let chord = chord * (one - square * L::F::splat(1.0 / 12.0));
-        let distance = (over * over + chord).sqrt();
-        let depth = distance * self.shortening;
-        End { along, over, distance, depth, falls: self.level * phi }
+        // By the law of sines: the end is (1 + z/R) sin(phi) / cos(elevation) radii away.
+        let longer = (grown + k * over) * (one - square * L::F::splat(1.0 / 6.0));
+        let falls = self.across * self.shortening * depth * k;
+        End { along, over, distance: way * longer, depth: depth * longer, falls }
     }
 }

@@ -3,9 +3,12 @@
 //! Central differences at the four posts around a place, bilinear between, from the
 //! level of the height pyramid whose posts are as far apart as pixels are: shading from
 //! finer posts than a pixel can show would glitter at the horizon.
+//!
+//! Step by step for some places at once, as in `photo`.
 
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
+use super::{AT_ONCE, VECTORS};
 use crate::field::Wanted;
 use crate::lanes::as_bits;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
@@ -15,111 +18,198 @@ use terrafarm_terrain::tile::{Codes, Floats as Floats32, HeightTile, Heights, VO
 /// How far off a layer's posts, in posts, a contact may lie by rounding.
 const ROUNDING_POSTS: f32 = 0.01;
 
-/// Slopes along x and y.
-pub(crate) struct Slopes<L: Lanes> {
-    pub slopes: [L::F; 2],
-    /// A tile was missing.
-    pub unsure: L::M,
+/// Places of a batch in one layer, and the cells around them in one of its levels. Masks
+/// are bits, one word a vector.
+pub(crate) struct Cells {
+    /// The places that the layer shows.
+    pub lanes: [u32; VECTORS],
+    cell: [[i32; AT_ONCE]; 2],
+    part: [[f32; AT_ONCE]; 2],
+    /// The finer level, and the share of the coarser one.
+    level: [i32; AT_ONCE],
+    coarser: [f32; AT_ONCE],
+    /// The places whose cells are to be read.
+    wanted: [u32; VECTORS],
+    /// Of a cell in its level: the tile, the post in it before the cell's own along both
+    /// axes, and the place in the cell.
+    number: [i32; AT_ONCE],
+    post: [i32; AT_ONCE],
+    place: [[f32; AT_ONCE]; 2],
 }
 
-/// Slopes of the uppermost layer at places so many metres east and north of the camera,
-/// for pixels `size_m` across there.
-#[inline(always)]
-pub(crate) fn slopes<L: Lanes>(
-    layers: &mut [Sheets<HeightTile>],
-    along: [L::F; 2],
-    size_m: L::F,
-    lanes: L::M,
-    wanted: &mut Wanted,
-) -> Slopes<L> {
-    let zero = L::F::splat(0.0);
-    let mut found: Slopes<L> = Slopes { slopes: [zero; 2], unsure: L::M::none() };
-    let mut left = lanes;
-    let mut number = layers.len();
-    while number > 0 && left.any() {
-        number -= 1;
-        let sheets = &mut layers[number];
-        let (inside, spot) = sheets.spot::<L>(along, ROUNDING_POSTS);
-        // The lowest takes what is beside all layers by rounding.
-        let here = if number == 0 { left } else { left & inside };
-        if here.any() {
-            of_layer::<L>(sheets, &spot, size_m, here, &mut found, wanted);
+impl Cells {
+    pub(crate) fn new() -> Self {
+        let (none, zero) = ([0.0; AT_ONCE], [0; AT_ONCE]);
+        Cells {
+            lanes: [0; VECTORS],
+            cell: [zero; 2],
+            part: [none; 2],
+            level: zero,
+            coarser: none,
+            wanted: [0; VECTORS],
+            number: zero,
+            post: zero,
+            place: [none; 2],
         }
-        left = left & !here;
     }
-    found
-}
 
-#[inline(always)]
-fn of_layer<L: Lanes>(
-    sheets: &mut Sheets<HeightTile>,
-    spot: &Spot<L>,
-    size_m: L::F,
-    lanes: L::M,
-    found: &mut Slopes<L>,
-    wanted: &mut Wanted,
-) {
-    let zero = L::F::splat(0.0);
-    let finest = sheets.rate[0].min(sheets.rate[1]);
-    let between = Between::<L>::of(size_m * L::F::splat(finest), sheets.top());
-    let mut pass = 0;
-    while pass < 2 {
-        let level = between.level + L::I::splat(pass);
-        let needed = if pass == 0 {
-            lanes & between.share.lt(L::F::splat(1.0))
-        } else {
-            lanes & zero.lt(between.share)
-        };
-        // What one level alone shows is not blended with the other.
-        let share = if pass == 0 { L::F::splat(1.0) } else { between.share };
-        let place = spot.at_level(level);
-        let mut left = needed;
+    /// No place of vector `n` sees the layer.
+    #[inline(always)]
+    pub(crate) fn leave(&mut self, n: usize) {
+        self.lanes[n] = 0;
+    }
+
+    /// Finds the places of vector `n`, so many metres east and north of the camera, for
+    /// pixels `size_m` across there. The lowest layer takes what is beside all layers by
+    /// rounding.
+    #[inline(always)]
+    pub(crate) fn lay<L: Lanes>(
+        &mut self,
+        sheets: &Sheets<HeightTile>,
+        n: usize,
+        along: [L::F; 2],
+        size_m: L::F,
+        lanes: L::M,
+        is_lowest: bool,
+    ) {
+        let at = n * L::N;
+        let (inside, spot) = sheets.spot::<L>(along, ROUNDING_POSTS);
+        let here = if is_lowest { lanes } else { lanes & inside };
+        self.lanes[n] = here.bits();
+        let finest = sheets.rate[0].min(sheets.rate[1]);
+        let between = Between::<L>::of(size_m * L::F::splat(finest), sheets.top());
+        for axis in 0..2 {
+            spot.cell[axis].store(&mut self.cell[axis][at..]);
+            spot.part[axis].store(&mut self.part[axis][at..]);
+        }
+        between.level.store(&mut self.level[at..]);
+        between.share.store(&mut self.coarser[at..]);
+    }
+
+    #[inline(always)]
+    fn level<L: Lanes>(&self, at: usize, is_coarser: bool) -> L::I {
+        L::I::load(&self.level[at..]) + L::I::splat(i32::from(is_coarser))
+    }
+
+    /// Finds the cells of vector `n` in the finer level, or in the coarser one.
+    #[inline(always)]
+    pub(crate) fn place<L: Lanes>(
+        &mut self,
+        sheets: &Sheets<HeightTile>,
+        n: usize,
+        is_coarser: bool,
+    ) {
+        let at = n * L::N;
+        let coarser = L::F::load(&self.coarser[at..]);
+        let shown =
+            if is_coarser { L::F::splat(0.0).lt(coarser) } else { coarser.lt(L::F::splat(1.0)) };
+        let wanted = L::M::from_bits(self.lanes[n]) & shown;
+        self.wanted[n] = wanted.bits();
+        if !wanted.any() {
+            return;
+        }
+        let level = self.level::<L>(at, is_coarser);
+        let mut known = first::<L>(level, wanted);
+        let [x, y] = sheets.sheet(known).last_tile;
+        let mut last = [L::I::splat(x), L::I::splat(y)];
+        let mut left = wanted & !level.eq(L::I::splat(known));
         while left.any() {
-            let here_level = first::<L>(level, left);
-            let sheet = sheets.sheet(here_level);
-            let last = sheet.last_tile;
-            let (tx, i) = Sheet::tile_of::<L>(L::I::splat(last[0]), place.cell[0]);
-            let (ty, j) = Sheet::tile_of::<L>(L::I::splat(last[1]), place.cell[1]);
-            let tiles = sheet.number::<L>(tx, ty);
-            let number = first::<L>(tiles, left);
-            let here = left & level.eq(L::I::splat(here_level)) & tiles.eq(L::I::splat(number));
+            known = first::<L>(level, left);
+            let here = left & level.eq(L::I::splat(known));
+            let other = sheets.sheet(known).last_tile;
+            for axis in 0..2 {
+                last[axis] = L::I::select(here, L::I::splat(other[axis]), last[axis]);
+            }
             left = left & !here;
-            let tile = match sheets.tile(here_level, number, wanted) {
+        }
+        let [x, y] = &self.cell;
+        let [x_part, y_part] = &self.part;
+        let spot: Spot<L> = Spot {
+            cell: [L::I::load(&x[at..]), L::I::load(&y[at..])],
+            part: [L::F::load(&x_part[at..]), L::F::load(&y_part[at..])],
+        };
+        let spot = spot.at_level(level);
+        let (tx, i) = Sheet::tile_of::<L>(last[0], spot.cell[0]);
+        let (ty, j) = Sheet::tile_of::<L>(last[1], spot.cell[1]);
+        (ty.times(last[0] + L::I::splat(1)) + tx).store(&mut self.number[at..]);
+        let (post, [x, y]) = post::<L>([i, j], spot.part);
+        post.store(&mut self.post[at..]);
+        x.store(&mut self.place[0][at..]);
+        y.store(&mut self.place[1][at..]);
+    }
+
+    /// The slopes along x and y of the cells of vector `n` that [`Cells::place`] has found:
+    /// of the coarser level, they are blended with those of the finer one. Places whose
+    /// tiles are not loaded are added to `unsure`, and the tiles to `missing`.
+    #[inline(always)]
+    pub(crate) fn read<L: Lanes>(
+        &self,
+        sheets: &mut Sheets<HeightTile>,
+        n: usize,
+        is_coarser: bool,
+        slopes: &mut [[f32; AT_ONCE]; 2],
+        unsure: &mut u32,
+        missing: &mut Wanted,
+    ) {
+        let mut left = L::M::from_bits(self.wanted[n]);
+        if !left.any() {
+            return;
+        }
+        let at = n * L::N;
+        let [x, y] = &self.place;
+        let place = [L::F::load(&x[at..]), L::F::load(&y[at..])];
+        let (number, post) = (L::I::load(&self.number[at..]), L::I::load(&self.post[at..]));
+        let level = self.level::<L>(at, is_coarser);
+        // What one level alone shows is not blended with the other.
+        let share = if is_coarser { L::F::load(&self.coarser[at..]) } else { L::F::splat(1.0) };
+        let [x, y] = &*slopes;
+        let mut found = [L::F::load(&x[at..]), L::F::load(&y[at..])];
+        while left.any() {
+            let (known_level, known) = (first::<L>(level, left), first::<L>(number, left));
+            let here = left & level.eq(L::I::splat(known_level)) & number.eq(L::I::splat(known));
+            left = left & !here;
+            let tile = match sheets.tile(known_level, known, missing) {
                 Soil::Tile(tile) => tile,
                 Soil::Empty => continue,
                 Soil::Absent => {
-                    found.unsure = found.unsure | here;
+                    *unsure |= here.bits();
                     continue;
                 }
             };
-            let (known, rise) = rises::<L>(tile, [i, j], place.part, here);
-            let scale = shrink::<L>(L::I::splat(here_level));
+            let (known, rise) = rises::<L>(tile, post, place, here);
+            let scale = shrink::<L>(L::I::splat(known_level));
             for axis in 0..2 {
                 let slope = rise[axis] * (scale * L::F::splat(sheets.rate[axis]));
-                let before = found.slopes[axis];
-                let slope = before + (slope - before) * share;
-                found.slopes[axis] = L::F::select(here & known, slope, before);
+                let slope = lerp::<L>(found[axis], slope, share);
+                found[axis] = L::F::select(here & known, slope, found[axis]);
             }
         }
-        pass += 1;
+        for axis in 0..2 {
+            found[axis].store(&mut slopes[axis][at..]);
+        }
     }
+}
+
+/// The post to the south-west of a cell's own, of which there is a ring, and the place in
+/// the cell.
+#[inline(always)]
+fn post<L: Lanes>(cell: [L::I; 2], part: [L::F; 2]) -> (L::I, [L::F; 2]) {
+    // The last tile's last post is the end of a cell, too.
+    let most = L::I::splat((1 << TILE_BITS) - 1);
+    let (i, j) = (cell[0].min(most), cell[1].min(most));
+    let x = part[0] + (cell[0] - i).to_floats();
+    let y = part[1] + (cell[1] - j).to_floats();
+    (j.times(L::I::splat(TILE_POSTS as i32)) + i, [x, y])
 }
 
 /// Rise a cell along x and y, and whether any post around knows of one.
 #[inline(always)]
 fn rises<L: Lanes>(
     tile: &HeightTile,
-    cell: [L::I; 2],
-    part: [L::F; 2],
+    at: L::I,
+    [x, y]: [L::F; 2],
     lanes: L::M,
 ) -> (L::M, [L::F; 2]) {
-    // The last tile's last post is the end of a cell, too.
-    let most = L::I::splat((1 << TILE_BITS) - 1);
-    let (i, j) = (cell[0].min(most), cell[1].min(most));
-    let x = part[0] + (cell[0] - i).to_floats();
-    let y = part[1] + (cell[1] - j).to_floats();
-    // The post to the south-west of the cell's own; there is a ring.
-    let at = j.times(L::I::splat(TILE_POSTS as i32)) + i;
     match tile.heights() {
         Heights::Codes(codes) if !tile.has_voids() => {
             let [dx, dy] = whole_codes::<L>(&codes, at, [x, y], lanes);
@@ -134,12 +224,9 @@ fn rises<L: Lanes>(
 /// Twice the rise a cell where no post is void, in steps of the codes.
 #[inline(always)]
 fn whole_codes<L: Lanes>(codes: &Codes, at: L::I, [x, y]: [L::F; 2], lanes: L::M) -> [L::F; 2] {
-    let width = L::I::splat(TILE_POSTS as i32);
     let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
-    let (z01, z23) = L::I::gather_fours(codes.posts, at, lanes);
-    let (a01, a23) = L::I::gather_fours(codes.posts, at + width, lanes);
-    let (b01, b23) = L::I::gather_fours(codes.posts, at + width + width, lanes);
-    let (y01, y23) = L::I::gather_fours(codes.posts, at + width + width + width, lanes);
+    let rows = L::I::gather_rows(codes.posts, at, TILE_POSTS, lanes);
+    let [(z01, z23), (a01, a23), (b01, b23), (y01, y23)] = rows;
     let (a0, a1) = (a01 & low, a01.shr(sixteen) & low);
     let (a2, a3) = (a23 & low, a23.shr(sixteen) & low);
     let (b0, b1) = (b01 & low, b01.shr(sixteen) & low);
@@ -159,16 +246,9 @@ type Posts<L> = [<L as Lanes>::F; 12];
 
 #[inline(always)]
 fn coded<L: Lanes>(codes: &Codes, at: L::I, lanes: L::M) -> Posts<L> {
-    let width = L::I::splat(TILE_POSTS as i32);
-    let mut at = at;
-    let mut rows = [L::I::splat(0); 8];
-    let mut row = 0;
-    while row < 4 {
-        let (west, east) = L::I::gather_fours(codes.posts, at, lanes);
-        (rows[2 * row], rows[2 * row + 1]) = (west, east);
-        at = at + width;
-        row += 1;
-    }
+    let rows = L::I::gather_rows(codes.posts, at, TILE_POSTS, lanes);
+    let rows =
+        [rows[0].0, rows[0].1, rows[1].0, rows[1].1, rows[2].0, rows[2].1, rows[3].0, rows[3].1];
     let step = codes.step as f32;
     [
         height::<L>(rows[0], true, step),
@@ -269,8 +349,8 @@ mod tests {
     /// Rises in a cell of a tile; `None` if no post knows of any.
     fn at(tile: &HeightTile, cell: [i32; 2], part: [f32; 2]) -> Option<[f32; 2]> {
         let lanes = <One as Lanes>::M::from_bits(1);
-        let (known, rise) =
-            rises::<One>(tile, cell.map(Ints::splat), part.map(Floats::splat), lanes);
+        let (post, place) = post::<One>(cell.map(Ints::splat), part.map(Floats::splat));
+        let (known, rise) = rises::<One>(tile, post, place, lanes);
         let mut found = [[0.0f32; 1]; 2];
         rise[0].store(&mut found[0]);
         rise[1].store(&mut found[1]);

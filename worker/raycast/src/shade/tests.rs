@@ -14,7 +14,8 @@ const SIZE: (u32, u32) = (170, 96);
 
 fn light(sun: &Sun, slopes: [f32; 2]) -> f32 {
     let mut out = [0.0];
-    Sunlight::new(sun).light::<One>(slopes.map(Floats::splat)).store(&mut out);
+    let slopes = slopes.map(Floats::splat);
+    Sunlight::new(sun).light::<One>(slopes, steepness::<One>(slopes)).store(&mut out);
     out[0]
 }
 
@@ -119,7 +120,8 @@ fn shaded(shader: &mut Shader, distances: &[f32]) -> [Vec<f32>; 3] {
     let y: Vec<f32> = (0..distances.len()).map(|n| at(n).1 as f32 + 0.5).collect();
     let mut light = [0, 1, 2].map(|_| vec![9.0; distances.len()]);
     let [red, green, blue] = &mut light;
-    shader.shade(Places { x: &x, y: &y, s: distances }, [red, green, blue]);
+    let places = Places { at: At::Each(&x, &y), far: Far::Map(distances) };
+    shader.shade(places, [red, green, blue]);
     light
 }
 
@@ -145,8 +147,8 @@ fn all_widths_and_all_runs_give_the_same_bits() {
         let mut shader = Shader::new(field, &view.camera, &view.shading, 1);
         for n in (0..distances.len()).rev().step_by(37) {
             let (x, y) = (n as u32 % SIZE.0, n as u32 / SIZE.0);
-            let places =
-                Places { x: &[x as f32 + 0.5], y: &[y as f32 + 0.5], s: &distances[n..=n] };
+            let at = At::Each(&[x as f32 + 0.5], &[y as f32 + 0.5]);
+            let places = Places { at, far: Far::Map(&distances[n..=n]) };
             let mut one = [[0.0f32]; 3];
             let [red, green, blue] = &mut one;
             shader.shade(places, [red, green, blue]);
