@@ -5,11 +5,10 @@
 //! wider pixels are filtered from coarser levels, until one is loaded. So a picture is
 //! blurred where terrain is missing, and has no holes; it says how much of it is.
 
-use crate::fast;
 use crate::field::Field;
 use crate::lanes;
 use crate::pyramid::Pyramid;
-use crate::shade::{Places, Shader};
+use crate::shade::{At, Far, Places, Shader};
 use crate::sight::{Unseen, depths_at_hand};
 use crate::{View, srgb};
 use std::collections::BTreeSet;
@@ -68,14 +67,11 @@ pub fn render_at_hand(
     let mut colors = Colors::new(field, view);
     let columns = region.width as usize;
     let x: Vec<f32> = (0..region.width).map(|x| (region.x + x) as f32 + 0.5).collect();
-    let mut s = vec![0.0; columns];
     let mut light = [0, 1, 2].map(|_| vec![0.0; columns]);
     let rows = pixels.chunks_exact_mut(3 * columns.max(1)).zip(0..region.height);
     for (pixels, row) in rows {
         let depths = &seen.depths.inverse_depth[row as usize * columns..][..columns];
-        fast::map_distances(&view.camera, region, row, depths, &mut s);
-        let y = vec![(region.y + row) as f32 + 0.5; columns];
-        colors.row(Places { x: &x, y: &y, s: &s }, &mut light);
+        colors.row(&x, (region.y + row) as f32 + 0.5, depths, &mut light);
         srgb::encode_all(light.each_ref().map(Vec::as_slice), pixels, lanes::widest());
     }
     let mut wanted = BTreeSet::from_iter(seen.wanted);
@@ -106,11 +102,13 @@ impl<'a> Colors<'a> {
         Colors { shader, wider: Vec::new(), field, view, coarser: 0, holes: 0 }
     }
 
-    fn row(&mut self, places: Places, light: &mut [Vec<f32>; 3]) {
+    /// Shades places of a row of pixels, with one over their depths.
+    fn row(&mut self, x: &[f32], y: f32, inverse_depth: &[f32], light: &mut [Vec<f32>; 3]) {
         let [red, green, blue] = &mut *light;
+        let places = Places { at: At::Net(x, &[y]), far: Far::Inverse(inverse_depth) };
         self.shader.shade(places, [red, green, blue]);
         let unknown = |light: &[Vec<f32>; 3]| -> Vec<usize> {
-            (0..places.s.len()).filter(|&at| light[0][at].is_nan()).collect()
+            (0..x.len()).filter(|&at| light[0][at].is_nan()).collect()
         };
         let mut open = unknown(light);
         let count = open.len();
@@ -124,10 +122,11 @@ impl<'a> Colors<'a> {
                 self.wider.push(shader);
             }
             let of = |values: &[f32]| -> Vec<f32> { open.iter().map(|&at| values[at]).collect() };
-            let (x, y, s) = (of(places.x), of(places.y), of(places.s));
+            let (x, inverse) = (of(x), of(inverse_depth));
             let mut again = [0, 1, 2].map(|_| vec![0.0; open.len()]);
             let [red, green, blue] = &mut again;
-            self.wider[doubling].shade(Places { x: &x, y: &y, s: &s }, [red, green, blue]);
+            let places = Places { at: At::Net(&x, &[y]), far: Far::Inverse(&inverse) };
+            self.wider[doubling].shade(places, [red, green, blue]);
             for (light, again) in light.iter_mut().zip(&again) {
                 for (&at, &value) in open.iter().zip(again) {
                     light[at] = value;

@@ -545,7 +545,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         profile.high = L::F::select(lanes, high, profile.high);
         profile.curl = L::F::select(lanes, curl, profile.curl);
         let solid = solid & lanes;
-        self.split = profile.cut(self.relief, self.fineness.straight, lanes) & solid;
+        self.split = profile.cut(self.relief, self.fineness.straight, lanes, solid);
         let (s, height) = profile.vertex();
         self.stretch.reach(self.relief, s, height, lanes);
         self.ready = solid & self.stretch.is_met(self.rise, self.across);

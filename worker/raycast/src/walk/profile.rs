@@ -58,16 +58,16 @@ impl<L: Lanes> Profile<L> {
     }
 
     /// Sets out for the first vertex behind the start of a cell. With more than `allowed`
-    /// metres a metre away between ground and stretches there will be more of these.
-    /// Returns the lanes with more than one.
+    /// metres a metre away between ground and stretches there will be more of these, if
+    /// there is ground. Returns the lanes with more than one.
     #[inline(always)]
-    pub fn cut(&mut self, relief: &Relief, allowed: f32, lanes: L::M) -> L::M {
+    pub fn cut(&mut self, relief: &Relief, allowed: f32, lanes: L::M, solid: L::M) -> L::M {
         let one = L::F::splat(1.0);
         let length = self.end - self.start;
         let arc = L::F::splat(0.5 * relief.curvature as f32) * length * length;
         let off = (self.curl - arc).abs() * L::F::splat(0.25);
         let allowed = L::F::splat(allowed) * self.start;
-        let many = lanes & allowed.lt(off);
+        let many = solid & allowed.lt(off);
         (self.t, self.step) =
             (L::F::select(lanes, one, self.t), L::F::select(lanes, one, self.step));
         if many.any() {
