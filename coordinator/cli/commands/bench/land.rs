@@ -19,7 +19,7 @@ use terrafarm_terrain::layout::{
     HeightDatum, ImportReport, Layer, LayerKind, Level, StoreIndex, TILE_CELLS, TileEntry, TileKey,
 };
 use terrafarm_terrain::resident::Resident;
-use terrafarm_terrain::sample::height_at;
+use terrafarm_terrain::sample::Sampler;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_terrain::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
 
@@ -284,11 +284,12 @@ impl Land {
     /// The highest ground within so many metres east, west, north and south of a place,
     /// looked at in 61 x 61 points; 0 where there is none.
     pub fn highest_around(&self, at: [f64; 2], reach_m: f64) -> anyhow::Result<f64> {
+        let mut sampler = Sampler::new(&self.store);
         let mut highest = f64::NEG_INFINITY;
         for j in -30..=30 {
             for i in -30..=30 {
                 let [x, y] = [i, j].map(|step| f64::from(step) / 30.0 * reach_m);
-                let ground = height_at(&self.store, at[0] + x, at[1] + y)?;
+                let ground = sampler.height_at(at[0] + x, at[1] + y)?;
                 highest = highest.max(ground.unwrap_or(f64::NEG_INFINITY));
             }
         }
