@@ -55,13 +55,15 @@ pub fn cells(size: (u32, u32), short: bool) -> anyhow::Result<Vec<Cell>> {
     Ok(Method::ALL.into_iter().map(cell).collect())
 }
 
-/// Pixels whose distance differs between a scene and the same over another land.
+/// Pixels whose distance differs between a scene and the same over another land by more than
+/// the last bit: places are counted in cells from the first post, so that a number of this
+/// size has nine bits less behind the point.
 fn differing(scene: &Scene, other: &Land, quality: Quality) -> Result<usize, Refusal> {
     let view = View { quality, ..scene.view.clone() };
     let [a, b] = [kernel::answer(&scene.land, &view)?, kernel::answer(other, &view)?];
     let ground = a.inverse_depth.iter().filter(|inverse| **inverse > 0.0).count();
     let apart = a.inverse_depth.iter().zip(&b.inverse_depth);
-    let apart = apart.filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+    let apart = apart.filter(|(a, b)| a.to_bits().abs_diff(b.to_bits()) > 1).count();
     // No ground at all would agree, too.
     Ok(if ground == 0 { a.inverse_depth.len() } else { apart })
 }
