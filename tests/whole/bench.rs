@@ -122,9 +122,12 @@ fn no_method_is_silently_wrong_in_any_scene_of_the_stability_suite() {
     let cells = report["cells"].as_array().unwrap();
     let scenes: std::collections::BTreeSet<_> =
         cells.iter().map(|cell| cell["scene"].as_str().unwrap()).collect();
-    assert!(scenes.len() >= 30, "{scenes:?}");
+    assert!(scenes.len() >= 45, "{scenes:?}");
     for cell in cells {
         assert_ne!(cell["outcome"], "silent", "{cell}");
+        let share = cell["fallback_share"].as_f64().unwrap_or(0.0);
+        assert_eq!(cell["outcome"] == "fallback", share > 0.0, "{cell}");
     }
+    assert!(cells.iter().any(|cell| cell["outcome"] == "fallback"));
     assert_eq!(ended.status.code(), Some(0));
 }

@@ -7,15 +7,19 @@ pub mod noise;
 
 use anyhow::{Context, bail};
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use tempfile::TempDir;
 use terrafarm_common::shading::Earth;
+use terrafarm_import::{ImportRequest, ImportSettings};
 use terrafarm_raycast::Pyramid;
 use terrafarm_synth::SynthSpec;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, StoreIndex, TileKey};
+use terrafarm_terrain::layout::{
+    HeightDatum, ImportReport, Layer, LayerKind, Level, StoreIndex, TILE_CELLS, TileEntry, TileKey,
+};
 use terrafarm_terrain::resident::Resident;
-use terrafarm_terrain::sample::height_at;
+use terrafarm_terrain::sample::Sampler;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_terrain::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
 
@@ -63,8 +67,32 @@ impl<F: Fn(u64, u64) -> f32 + Sync> LayerSource for Rule<F> {
         _height: usize,
         into: &mut [f32],
     ) -> Result<(), SourceError> {
-        for (at, post) in into.iter_mut().enumerate() {
-            *post = self.0(i0 as u64 + (at % width) as u64, j0 as u64 + (at / width) as u64);
+        for (row, j) in into.chunks_exact_mut(width).zip(j0 as u64..) {
+            for (post, i) in row.iter_mut().zip(i0 as u64..) {
+                *post = self.0(i, j);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Colours as a function of column and row: sRGB, opaque.
+pub struct Paint<F>(pub F);
+
+impl<F: Fn(u64, u64) -> [u8; 3] + Sync> LayerSource for Paint<F> {
+    fn colors(
+        &self,
+        i0: i64,
+        j0: i64,
+        width: usize,
+        _height: usize,
+        into: &mut [[u8; 4]],
+    ) -> Result<(), SourceError> {
+        for (row, j) in into.chunks_exact_mut(width).zip(j0 as u64..) {
+            for (pixel, i) in row.iter_mut().zip(i0 as u64..) {
+                let [r, g, b] = self.0(i, j);
+                *pixel = [r, g, b, 255];
+            }
         }
         Ok(())
     }
@@ -106,6 +134,87 @@ impl Land {
         builder.add_layer(spec, heights, &|_, _| (), &AtomicBool::new(false))?;
         builder.finish(ImportReport::default())?;
         Self::load(name.to_owned(), StoreReader::open(&path)?, Load::Heights, Some(folder))
+    }
+
+    /// A photo over level ground of one cell, its south-west pixel at (0, 0).
+    pub fn photo(
+        name: &str,
+        spacing_m: f64,
+        pixels: u64,
+        colors: &dyn LayerSource,
+    ) -> anyhow::Result<Land> {
+        let side = (pixels - 1) as f64 * spacing_m;
+        let folder = tempfile::tempdir().context("cannot make a temporary folder")?;
+        let path = folder.path().join("photo.terrain");
+        let mut builder = StoreBuilder::create(&path, "LOCAL", HeightDatum::Unknown, None)?;
+        let ground = height_layer([side; 2], [2; 2], Some(1.0));
+        let photo = LayerSpec {
+            kind: LayerKind::Photo,
+            quantum_m: None,
+            ..height_layer([spacing_m; 2], [pixels; 2], None)
+        };
+        let stop = AtomicBool::new(false);
+        builder.add_layer(ground, &Rule(|_, _| 0.0), &|_, _| (), &stop)?;
+        builder.add_layer(photo, colors, &|_, _| (), &stop)?;
+        builder.finish(ImportReport::default())?;
+        Self::load(name.to_owned(), StoreReader::open(&path)?, Load::All, Some(folder))
+    }
+
+    /// Files of elevation, by name and content, imported as those of a user are.
+    pub fn imported(
+        name: &str,
+        files: &[(&str, String)],
+        source_crs: &str,
+    ) -> anyhow::Result<Land> {
+        let folder = tempfile::tempdir().context("cannot make a temporary folder")?;
+        let mut request = ImportRequest {
+            output: folder.path().join("imported.terrain"),
+            settings: ImportSettings { source_crs: Some(source_crs.into()), ..Default::default() },
+            ..ImportRequest::default()
+        };
+        for (file, content) in files {
+            let path = folder.path().join(file);
+            std::fs::write(&path, content)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+            request.elevation.push(path);
+        }
+        terrafarm_import::import(&request, &|_| (), &AtomicBool::new(false))?;
+        let store = StoreReader::open(&request.output)?;
+        Self::load(name.to_owned(), store, Load::Heights, Some(folder))
+    }
+
+    /// The only tile of a land as the north-east corner of one of so many cells, all else
+    /// void. Coarser levels repeat the tile and say that it cannot be compared, as those of
+    /// tiles with voids do: nobody who heeds that looks at them.
+    pub fn moved_to_far_corner(self, cells: [u64; 2]) -> anyhow::Result<Land> {
+        let mut index = StoreIndex::clone(self.resident.index());
+        let layer = &mut index.layers[0];
+        let own = layer.levels[0].entries[0];
+        let origin = [0, 1].map(|axis| {
+            layer.origin[axis] - (cells[axis] - TILE_CELLS as u64) as f64 * layer.spacing[axis]
+        });
+        (layer.origin, layer.posts) = (origin, cells.map(|cells| cells + 1));
+        let level = |level: usize| {
+            let tiles = Layer::tiles_for(layer.level_posts(level));
+            let mut entries = vec![TileEntry::EMPTY; tiles[0] as usize * tiles[1] as usize];
+            if let Some(last) = entries.last_mut() {
+                let deviation = if level == 0 { 0.0 } else { f32::INFINITY };
+                *last = TileEntry { deviation, ..own };
+            }
+            Level { tiles, entries }
+        };
+        layer.levels = (0..Layer::level_count(layer.posts)).map(level).collect();
+        index.check().map_err(|why| anyhow::anyhow!("{}: {why}", self.name))?;
+        let mut resident = Resident::new(Arc::new(index));
+        let first = TileKey { layer: 0, level: 0, tx: 0, ty: 0 };
+        for (number, level) in resident.index().clone().layers[0].levels.iter().enumerate() {
+            if let Some(tile) = self.store.read_tile(first)? {
+                let [tx, ty] = level.tiles.map(|count| count - 1);
+                resident.insert(TileKey { layer: 0, level: number as u16, tx, ty }, tile);
+            }
+        }
+        let pyramid = Pyramid::new(resident.index());
+        Ok(Land { resident, pyramid, ..self })
     }
 
     fn load(
@@ -175,11 +284,12 @@ impl Land {
     /// The highest ground within so many metres east, west, north and south of a place,
     /// looked at in 61 x 61 points; 0 where there is none.
     pub fn highest_around(&self, at: [f64; 2], reach_m: f64) -> anyhow::Result<f64> {
+        let mut sampler = Sampler::new(&self.store);
         let mut highest = f64::NEG_INFINITY;
         for j in -30..=30 {
             for i in -30..=30 {
                 let [x, y] = [i, j].map(|step| f64::from(step) / 30.0 * reach_m);
-                let ground = height_at(&self.store, at[0] + x, at[1] + y)?;
+                let ground = sampler.height_at(at[0] + x, at[1] + y)?;
                 highest = highest.max(ground.unwrap_or(f64::NEG_INFINITY));
             }
         }

@@ -8,7 +8,8 @@ use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_raycast::View;
 
-/// Renders a scene by a method and compares it with the scene's truth.
+/// Renders a scene by a method and compares it with the scene's truth. Tells how many
+/// pixels the method could not do its own way.
 pub fn cell(scene: &Scene, quality: Quality) -> Cell {
     let view = View { quality, ..scene.view.clone() };
     let method = quality.method.name();
@@ -24,18 +25,28 @@ pub fn cell(scene: &Scene, quality: Quality) -> Cell {
     if odd > 0 {
         return Cell::measured(scene.name, method, odd as f64, 0.0, "pixels not a distance");
     }
-    let promise = Promise::of(quality.method, quality.tolerance_px);
+    compared(scene, &view, &answer).with_fallbacks(&answer)
+}
+
+/// Compares an answer with the scene's truth.
+fn compared(scene: &Scene, view: &View, answer: &Depths) -> Cell {
+    let method = view.quality.method.name();
+    let promise = Promise::of(view.quality.method, view.quality.tolerance_px);
     match &scene.truth {
         Truth::Plane(plane) => {
-            let spread = Spread::of(plane_errors(&view, &answer, *plane));
+            let spread = Spread::of(plane_errors(view, answer, *plane));
             let value = promise.value(&spread);
             Cell::measured(scene.name, method, value, promise.bound_px, unit(&promise))
         }
         Truth::Edge(row_px) => {
-            let off = edge_error(&view, &answer, *row_px);
+            let off = edge_error(view, answer, *row_px);
             Cell::measured(scene.name, method, off, promise.bound_px, "px of the edge")
         }
-        _ => match surface_spread(scene, &view, &answer) {
+        Truth::Closed if answer.inverse_depth.contains(&0.0) => {
+            let sky = answer.inverse_depth.iter().filter(|inverse| **inverse == 0.0).count();
+            Cell::measured(scene.name, method, sky as f64, 0.0, "pixels of sky")
+        }
+        _ => match surface_spread(scene, view, answer) {
             Ok(spread) => {
                 let value = promise.value(&spread);
                 Cell::measured(scene.name, method, value, promise.bound_px, unit(&promise))

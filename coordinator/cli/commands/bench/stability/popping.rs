@@ -15,7 +15,6 @@ use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Haze, Shading, Sky, Sun};
 use terrafarm_raycast::View;
-use terrafarm_synth::SynthSpec;
 
 /// Tolerances at which the octave begins, pixels.
 const FIRST_PX: [f64; 2] = [0.5, 1.0];
@@ -33,16 +32,14 @@ const CAMERAS: [(f64, f64, f64); 2] = [(0.1, 300.0, -6.0), (0.25, 1200.0, -25.0)
 const CLEARED_M: f64 = 200.0;
 
 /// The cells of the methods that have levels.
-pub fn cells(size: (u32, u32), short: bool) -> anyhow::Result<Vec<Cell>> {
-    let posts = if short { 1025 } else { 2049 };
-    let land = Land::synth(SynthSpec { posts, spacing_m: 15.0, seed: 3, photo_scale: 1 })?;
+pub fn cells(land: &Land, size: (u32, u32)) -> anyhow::Result<Vec<Cell>> {
     let mut cells = Vec::new();
     for first_px in FIRST_PX {
         for method in [Method::Lod, Method::Column] {
             let mut moved = Vec::new();
             for stand in CAMERAS {
-                let view = view(&land, stand, size)?;
-                switch(&land, &view, method, first_px, &mut moved)
+                let view = view(land, stand, size)?;
+                switch(land, &view, method, first_px, &mut moved)
                     .map_err(|Refusal(why)| anyhow::anyhow!("{}: {why}", land.name))?;
             }
             cells.push(cell(method, first_px, moved));

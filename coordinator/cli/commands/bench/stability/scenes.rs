@@ -1,5 +1,6 @@
 //! The scenes: ground, camera and truth.
 
+use super::files;
 use super::judge::Plane;
 use crate::commands::bench::land::{Land, Rule, height_layer};
 use glam::DVec3;
@@ -20,6 +21,8 @@ const BELOW: [u8; 3] = [255, 0, 0];
 pub enum Truth {
     /// Another method: `exact`, and for it the reference.
     Surface,
+    /// As `Surface`, and no pixel sees the sky.
+    Closed,
     /// A plane; distances follow from a division.
     Plane(Plane),
     /// The row, in pixels from the top, at which ground begins in the middle column.
@@ -42,7 +45,7 @@ pub struct Scene {
 
 /// Where the camera stands and looks.
 #[derive(Clone, Copy)]
-struct Pose {
+pub struct Pose {
     at: [f64; 3],
     heading: f64,
     pitch: f64,
@@ -50,7 +53,8 @@ struct Pose {
     hfov: f64,
 }
 
-fn look(at: [f64; 3], heading: f64, pitch: f64) -> Pose {
+/// Upright, with a field of view of 60 degrees.
+pub fn look(at: [f64; 3], heading: f64, pitch: f64) -> Pose {
     Pose { at, heading, pitch, roll: 0.0, hfov: 60.0 }
 }
 
@@ -60,10 +64,12 @@ pub fn all(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
     scenes.extend(planes(size)?);
     scenes.extend(edges(size)?);
     scenes.extend(odd_grounds(size)?);
+    scenes.extend(files::scenes(size)?);
     Ok(scenes)
 }
 
-fn view(pose: Pose, size: (u32, u32), earth: Option<Earth>) -> View {
+/// The view from a pose, bare of light and air.
+pub fn view(pose: Pose, size: (u32, u32), earth: Option<Earth>) -> View {
     let eye = DVec3::from_array(pose.at);
     let Pose { heading, pitch, roll, hfov, .. } = pose;
     let shading = Shading {

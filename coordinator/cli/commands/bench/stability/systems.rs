@@ -1,6 +1,7 @@
 //! Scenes that are not about a method: flights, hillshades, tiles that are not there.
 
 use super::Cell;
+use super::scenes::{look, view};
 use crate::commands::bench::land::{Land, Rule, height_layer};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
@@ -8,7 +9,7 @@ use terrafarm_common::flight::{Flight, Keyframe};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_raycast::{Unseen, View, depths};
+use terrafarm_raycast::{Progress, Unfit, Unseen, View, depths, render};
 use terrafarm_terrain::hillshade::hillshade;
 use terrafarm_terrain::layout::PostWindow;
 use terrafarm_terrain::resident::Resident;
@@ -84,8 +85,61 @@ fn odd_light() -> anyhow::Result<Vec<Cell>> {
     Ok(cells)
 }
 
-/// No tile loaded: every method must name what it misses.
+/// Tiles that have not come: every method must name what it misses, and what it shows
+/// without must be what it shows with them.
 fn missing_tiles() -> anyhow::Result<Vec<Cell>> {
+    let mut cells = no_tile()?;
+    cells.extend(late_tiles()?);
+    Ok(cells)
+}
+
+/// A region waits for its tiles, however late: in parts of it that can be done before there
+/// is nothing made up, no coarser tile, no hole.
+fn late_tiles() -> anyhow::Result<Vec<Cell>> {
+    let land = Land::noise(1025)?;
+    let name = "tiles that are late";
+    let frame = Region::whole(97, 55);
+    let middle = land.at(0.5);
+    let high = land.highest_around(middle, 100.0)? + 300.0;
+    let cell = |method: Method| {
+        let mut view = view(look([middle[0], middle[1], high], 45.0, -20.0), (97, 55), None);
+        view.quality = Quality { method, samples_per_side: 1, ..Quality::default() };
+        let refused = |why: Unfit| Cell::refused(name, method.name(), why.to_string());
+        let whole = match render(&land.resident, &land.pyramid, &view, frame) {
+            Ok(whole) => whole.pixels,
+            Err(why) => return refused(why),
+        };
+        let mut late = land.resident.clone();
+        for key in land.resident.loaded() {
+            // Nor any coarser one that might stand in for them.
+            if key.level > 0 || (key.tx + key.ty) % 2 == 1 {
+                late.remove(key);
+            }
+        }
+        let mut progress = Progress::new(frame);
+        let missing = match progress.advance(&late, &land.pyramid, &view) {
+            Ok(missing) => missing,
+            Err(why) => return refused(why),
+        };
+        let early = progress.clone().into_rendered(missing.clone());
+        let pairs = |pixels: &[u8]| {
+            let other = |(was, is): &(&[u8], &[u8])| *was != [0; 3] && was != is;
+            pixels.chunks_exact(3).zip(whole.chunks_exact(3)).filter(other).count()
+        };
+        let made_up = pairs(&early.pixels);
+        // The tiles come, all at once: the region ends as if it had never waited.
+        let left = progress.advance(&land.resident, &land.pyramid, &view).map(|left| left.len());
+        let end = progress.into_rendered(Vec::new());
+        let differs = end.pixels != whole || left != Ok(0) || missing.is_empty();
+        let wrong = made_up + if differs { whole.len() / 3 } else { 0 };
+        Cell::measured(name, method.name(), wrong as f64, 0.0, "pixels made up")
+            .with_note(format!("{} tiles named", missing.len()))
+    };
+    Ok(Method::ALL.into_iter().map(cell).collect())
+}
+
+/// No tile loaded.
+fn no_tile() -> anyhow::Result<Vec<Cell>> {
     let land = Land::noise(257)?;
     let empty = Resident::new(land.resident.index().clone());
     let size = (33, 19);
