@@ -125,8 +125,8 @@ impl Progress {
         self.stats.steps += seen.steps;
         // Each go looks at the whole region: the last one counts.
         self.stats.fallbacks = seen.alone;
-        let hits = seen.inverse_depth.iter().filter(|&&inverse| inverse > 0.0).count();
-        self.stats.hits += hits as u64;
+        self.stats.hits +=
+            seen.inverse_depth.iter().map(|&inverse| u64::from(inverse > 0.0)).sum::<u64>();
         let mut shader = Shader::new(field, &view.camera, &view.shading, samples);
         let share = 1.0 / samples as f32;
         let middle = |sample: u32| (sample as f32 + 0.5) * share;

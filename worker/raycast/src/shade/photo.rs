@@ -277,16 +277,13 @@ impl Rows {
             let mut step = L::F::load(&self.begin[at..]);
             let mut going = here;
             while going.any() {
-                // A row has two texels at least.
-                for _ in 0..2 {
-                    let across = side + step * slant;
-                    let floor = across.floor();
-                    let part = across - floor.to_floats();
-                    let weight = weight::<L>(step, start, stop).max(zero) * scale;
-                    add::<L>(texels, texel + floor, part, weight, here, sum);
-                    step = step + L::F::splat(1.0);
-                    texel = texel + wide;
-                }
+                let across = side + step * slant;
+                let floor = across.floor();
+                let part = across - floor.to_floats();
+                let weight = weight::<L>(step, start, stop).max(zero) * scale;
+                add::<L>(texels, texel + floor, part, weight, here, sum);
+                step = step + L::F::splat(1.0);
+                texel = texel + wide;
                 going = going & step.lt(stop);
             }
         }
