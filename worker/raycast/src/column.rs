@@ -25,9 +25,10 @@ use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
 use crate::seen::Seen;
 use crate::walk::{Fineness, Lines, Rows, Walk};
-use doubts::Doubts;
+use doubts::{Doubts, SKY};
 use glam::DVec2;
 use net::{BENT, BROKEN, Bends, Net};
+pub(crate) use net::{TOLD, WHOLE};
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -39,6 +40,9 @@ const SPACINGS: [f64; 2] = [0.5, 4.0];
 /// How much neighbouring answers may bend for each pixel of tolerance, pixels. Measured: up
 /// to this the largest error stays what it is without.
 const BENDS: f64 = 2.0;
+/// How many rows lower, for each pixel between lines, ground is looked for that may come up
+/// between them: that is how steep a peak may be.
+const REACH: f64 = 1.5;
 /// Share of the tolerance by which the ground may be off the straight lines that rays see.
 const STRAIGHT: f64 = 0.25;
 /// A bound of the sum of the parts of a ray, up and along the map, of length 1.
@@ -169,30 +173,43 @@ impl Columns<'_, '_> {
         seen: &mut Seen,
     ) {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
-        // One more on each side to compare with.
-        let rays = |row: u32| fan.ray(row).saturating_sub(1)..fan.ray(row) + 2;
+        // One more on each side to compare with, and what may come up from below.
+        let rising = self.rises(frame, fan);
+        let reach = (REACH * fan.spacing).ceil() as i32;
+        let (before, after) = if rising { (reach + 1, 1) } else { (1, reach + 1) };
+        let rays = |row: u32| fan.ray(row) - before..fan.ray(row) + after + 1;
         let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
         let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
         let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
         // Whole vectors are looked at, and twice as much.
         let width = (end_line - first_line) as usize + 2 * MOST;
-        net.clear(first_ray, end_ray - first_ray, first_line, width);
+        net.clear(first_ray, (end_ray - first_ray) as usize, first_line, width);
         for block in (first_line..end_line).step_by(L::N) {
             let end = block + L::N as i32;
             let meets = |(span, _): &(&Span, u32)| span.lines.start < end && span.lines.end > block;
             let low = filled().filter(meets).map(|(_, row)| rays(row).start).min();
             let high = filled().filter(meets).map(|(_, row)| rays(row).end).max();
             if let (Some(low), Some(high)) = (low, high) {
-                seen.rays += ((high - low) * L::N) as u64;
+                seen.rays += (high - low) as u64 * L::N as u64;
                 seen.steps += self.block::<L>(frame, fan, block, low..high, net);
             }
         }
         let bends = BENDS * self.tolerance_px;
-        net.compare::<L>(Bends {
+        let bends = Bends {
             of_change: bends as f32,
             of_depth: (bends / (PARTS * self.camera.focal_px())) as f32,
-        });
+        };
+        net.compare::<L>(bends, rising, reach as usize);
+    }
+
+    /// Whether the rays of a line rise from row to row of a band.
+    fn rises(&self, frame: &Frame, fan: &Fan) -> bool {
+        let tangent = |ray: i32| {
+            let [x, y, z] = frame.ray(fan, 0.0, f64::from(ray * fan.towards)).to_array();
+            z / DVec2::new(x, y).length()
+        };
+        tangent(0) < tangent(1)
     }
 
     /// Casts rays of N lines. Returns the steps that it took.
@@ -202,14 +219,14 @@ impl Columns<'_, '_> {
         frame: &Frame,
         fan: &Fan,
         first: i32,
-        rays: Range<usize>,
+        rays: Range<i32>,
         net: &mut Net,
     ) -> u64 {
         let mut values = [[0.0f32; MOST]; 6];
         for lane in 0..L::N {
             let line = (f64::from(first) + lane as f64 + 0.5) * fan.spacing;
-            let start = frame.corner + frame.minor * line + frame.major * fan.reference;
-            let change = frame.major + frame.minor * (line * fan.q - fan.r);
+            let start = frame.ray(fan, line, 0.0);
+            let change = frame.ray(fan, line, 1.0) - start;
             let across = DVec2::new(start.x, start.y);
             let length = across.length();
             let along = across / length;
@@ -220,18 +237,18 @@ impl Columns<'_, '_> {
             }
         }
         // Rays in the order in which they rise.
-        let d = |ray: usize| ray as f32 * fan.towards as f32;
-        let tangent = |ray: usize| {
+        let d = |ray: i32| (ray * fan.towards) as f32;
+        let tangent = |ray: i32| {
             let [_, _, length, longer, rise, higher] = values.map(|value| value[0]);
             (rise + d(ray) * higher) / (length + d(ray) * longer)
         };
         let (low, high) = (rays.start, rays.end - 1);
         let onwards = tangent(low) <= tangent(high);
         let (begin, step) = if onwards { (low, 1) } else { (high, -1) };
-        let at = (begin - net.first_row) * net.width + (first - net.first_line) as usize;
+        let at = (begin - net.first_row) * net.width as i32 + (first - net.first_line);
         let mut places = [0; MOST];
         for (place, lane) in places.iter_mut().zip(0..) {
-            *place = at as i32 + lane;
+            *place = at + lane;
         }
         let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
         let rows = Rows {
@@ -241,7 +258,7 @@ impl Columns<'_, '_> {
             higher: L::F::load(&values[5]),
             first: d(begin),
             step: (fan.towards * step) as f32,
-            count: rays.len() as i32,
+            count: high - low + 1,
             at: L::I::load(&places),
             pitch: net.width as i32 * step,
         };
@@ -271,7 +288,7 @@ impl Columns<'_, '_> {
         let d = f64::from(row) + 0.5 - fan.reference;
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
         let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
-        let (answers, states) = net.row(fan.ray(row));
+        let [answers, states, tips] = net.row(fan.ray(row));
         let numbers = L::F::load(&NUMBERS);
         let sparse = scale < DENSEST;
         let region = self.region;
@@ -296,9 +313,7 @@ impl Columns<'_, '_> {
             };
             let answer = a + (b - a) * share;
             let count = L::N.min((pixels.end - pixel) as usize);
-            // The sky is never bent.
-            let doubtful = L::F::splat(BENT).le(state) & !(a.max(b).eq(L::F::splat(0.0)));
-            let doubtful = doubtful.bits() & (u32::MAX >> (32 - count));
+            let doubtful = L::F::splat(BENT).le(state).bits() & (u32::MAX >> (32 - count));
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
@@ -318,22 +333,50 @@ impl Columns<'_, '_> {
                 }
             }
             if doubtful != 0 {
-                let broken = state.eq(L::F::splat(BROKEN));
-                let first = L::F::select(broken, a.max(b), answer);
-                let second = L::F::select(broken, a.min(b), L::F::splat(0.0));
                 let (mut firsts, mut seconds) = ([0.0; MOST], [0.0; MOST]);
-                first.store(&mut firsts);
-                second.store(&mut seconds);
+                a.store(&mut firsts);
+                b.store(&mut seconds);
+                let (mut between, mut kinds) = ([0.0; MOST], [0.0; MOST]);
+                answer.store(&mut between);
+                state.store(&mut kinds);
+                left.store(&mut places);
                 let mut bits = doubtful;
                 while bits != 0 {
                     let lane = bits.trailing_zeros() as usize % MOST;
                     bits &= bits - 1;
                     let minor = pixel + lane as u32;
                     let place = if frame.by_rows { [minor, row] } else { [row, minor] };
-                    doubts.push(place, firsts[lane], seconds[lane]);
+                    let around = [firsts[lane], seconds[lane]];
+                    let guesses = match kinds[lane] {
+                        BENT => [between[lane], 0.0, 0.0],
+                        BROKEN => broken(around, None),
+                        _ => {
+                            let tips = &tips[places[lane] as usize..];
+                            let tip = tips[0].max(tips[1]);
+                            let same = around == [0.0; 2] || net::same(around);
+                            let other = if between[lane] > 0.0 { between[lane] } else { SKY };
+                            if same { [tip, other, 0.0] } else { broken(around, Some(tip)) }
+                        }
+                    };
+                    doubts.push(place, guesses);
                 }
             }
         }
+    }
+}
+
+/// Where a pixel may see ground between two rays that see different ground, or on a closer
+/// one that ends a little lower.
+fn broken([a, b]: [f32; 2], tip: Option<f32>) -> [f32; 3] {
+    if a.is_nan() || b.is_nan() {
+        return [0.0; 3];
+    }
+    let whole = |answer: f32| answer.to_bits() as i32 & WHOLE != 0;
+    // Behind voids there may be any ground, not just one of the two.
+    let far = if whole(a) && whole(b) { a.min(b) } else { 0.0 };
+    match tip {
+        Some(tip) => [tip, a.max(b), far],
+        None => [a.max(b), far, 0.0],
     }
 }
 

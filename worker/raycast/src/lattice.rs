@@ -72,6 +72,13 @@ impl Frame {
         }
     }
 
+    /// The ray `d` rows behind the reference row of a fan, on the line that is so many pixels
+    /// along it there.
+    pub(crate) fn ray(&self, fan: &Fan, line: f64, d: f64) -> DVec3 {
+        let minor = line + d * (line * fan.q - fan.r);
+        self.corner + self.minor * minor + self.major * (fan.reference + d)
+    }
+
     /// How far a row is from V, with a sign for the side; in units of V's last part.
     fn apart(&self, row: f64) -> f64 {
         row * self.v[2] - self.v[1]
@@ -191,10 +198,10 @@ impl Frame {
 }
 
 impl Fan {
-    /// The ray of each line that goes through a row of the band.
-    pub(crate) fn ray(&self, row: u32) -> usize {
+    /// The ray of each line that goes through a row.
+    pub(crate) fn ray(&self, row: u32) -> i32 {
         let apart = f64::from(row) + 0.5 - self.reference;
-        (apart * f64::from(self.towards)).max(0.0) as usize
+        apart as i32 * self.towards
     }
 
     /// The line through a point of a row, as a number that counts from line 0.

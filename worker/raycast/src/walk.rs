@@ -63,8 +63,9 @@ pub(crate) struct Fineness {
     /// Vertical distance that may be between the ground and straight lines, metres for each
     /// metre away.
     pub straight: f32,
-    /// Distance between rays, metres for each metre of depth. The last bit of an answer is
-    /// set if posts are further apart where it lies, and none of the tile is void.
+    /// Distance between rays, metres for each metre of depth. The last bits of an answer
+    /// are [`crate::column::WHOLE`] if no post of the tile is void, and [`crate::column::TOLD`] if besides posts are
+    /// further apart where it lies. With 0 for the distance they are not.
     pub apart: f32,
 }
 
@@ -238,9 +239,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let answer = self.stretch.contact(self.rise, self.across);
         // Coarse cells may reach beyond the layer, where there is nothing to meet.
         let inside = ready & (self.across * self.last).lt(answer);
-        let told = L::F::load(&soil.told).le(answer);
-        let last = L::I::select(told, L::I::splat(1), L::I::splat(0));
-        let answer = L::F::from_bits((answer.to_bits() & L::I::splat(!1)) + last);
+        let answer = if self.fineness.apart > 0.0 { soil.marked::<L>(answer) } else { answer };
         self.emit(answer, inside, met);
         (self.rise, self.across) = self.rows.ray(self.row);
         let more = inside & self.row.lt(L::I::splat(self.rows.count));

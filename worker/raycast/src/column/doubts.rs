@@ -19,28 +19,35 @@ pub(super) struct Doubts {
     /// Column and row in the picture.
     x: Vec<i32>,
     y: Vec<i32>,
-    /// One over the depths at which they may be: first that, and if it is not there, this.
-    first: Vec<f32>,
-    second: Vec<f32>,
+    /// One over the depths at which they may be, in the order in which they are tried; 0
+    /// for none, [`SKY`] if it is the sky then.
+    guesses: [Vec<f32>; GUESSES],
 }
+
+/// Guesses of a pixel at most.
+pub(super) const GUESSES: usize = 3;
+/// The guess that a pixel sees the sky.
+pub(super) const SKY: f32 = -1.0;
 
 impl Doubts {
     pub fn new() -> Self {
-        Doubts { x: Vec::new(), y: Vec::new(), first: Vec::new(), second: Vec::new() }
+        Doubts { x: Vec::new(), y: Vec::new(), guesses: [const { Vec::new() }; GUESSES] }
     }
 
-    pub fn push(&mut self, [x, y]: [u32; 2], first: f32, second: f32) {
+    #[inline]
+    pub fn push(&mut self, [x, y]: [u32; 2], guesses: [f32; GUESSES]) {
         self.x.push(x as i32);
         self.y.push(y as i32);
-        self.first.push(first);
-        self.second.push(second);
+        for (list, guess) in self.guesses.iter_mut().zip(guesses) {
+            list.push(guess);
+        }
     }
 
     fn clear(&mut self) {
         for list in [&mut self.x, &mut self.y] {
             list.clear();
         }
-        for list in [&mut self.first, &mut self.second] {
+        for list in &mut self.guesses {
             list.clear();
         }
     }
@@ -52,7 +59,7 @@ impl Doubts {
         for list in [&mut self.x, &mut self.y] {
             list.resize(full, list.last().copied().unwrap_or_default());
         }
-        for list in [&mut self.first, &mut self.second] {
+        for list in &mut self.guesses {
             list.resize(full, list.last().copied().unwrap_or_default());
         }
         count
@@ -87,23 +94,26 @@ impl Columns<'_, '_> {
                 let change = u * L::F::splat(right[n]) + v * L::F::splat(down[n]);
                 ray[n] = L::F::splat(corner[n]) + change;
             }
-            let (first, second) =
-                (L::F::load(&doubts.first[at..]), L::F::load(&doubts.second[at..]));
             let all = L::M::from_bits(u32::MAX >> (32 - L::N.min(count - at)));
-            let zero = L::F::splat(0.0);
-            let (mut answer, mut sure) = self.settle::<L>(ray, first, all);
-            let next = all & !sure & zero.lt(second);
-            if next.any() {
-                let (other, settled) = self.settle::<L>(ray, second, next);
-                answer = L::F::select(next, other, answer);
-                sure = sure | (next & settled);
+            let (zero, sky) = (L::F::splat(0.0), L::F::splat(SKY));
+            let (mut answer, mut sure) = (zero, L::M::none());
+            for guesses in &doubts.guesses {
+                let guess = L::F::load(&guesses[at..]);
+                let next = all & !sure & zero.lt(guess);
+                if next.any() {
+                    let (found, settled) = self.settle::<L>(ray, guess, next);
+                    answer = L::F::select(next & settled, found, answer);
+                    sure = sure | (next & settled);
+                }
+                // The answer then is 0.
+                sure = sure | (all & guess.eq(sky));
             }
             let places = (y - top).times(L::I::splat(self.region.width as i32)) + (x - left);
             answer.scatter(inverse_depth, places, all);
             let mut lost = (all & !sure).bits();
             if lost != 0 {
                 let (mut nearest, mut lanes) = ([0.0; MOST], [0; MOST]);
-                first.store(&mut nearest);
+                L::F::load(&doubts.guesses[0][at..]).store(&mut nearest);
                 places.store(&mut lanes);
                 while lost != 0 {
                     let lane = lost.trailing_zeros() as usize % MOST;

@@ -1,5 +1,6 @@
 //! The tiles under N lanes, and what they say of posts and of blocks.
 
+use crate::column::{TOLD, WHOLE};
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use terrafarm_terrain::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
 use terrafarm_terrain::tile::{HeightTile, Heights, MAXIMA_LEVELS, VOID};
@@ -18,6 +19,8 @@ pub(super) struct Soils {
     pub shrink: [f32; MOST],
     /// Inverse depth from which on no post can be between rays.
     pub told: [f32; MOST],
+    /// [`WHOLE`] for tiles without a void.
+    pub whole: [i32; MOST],
     /// Lanes whose values are heights as they are.
     wide: u32,
     /// Height of the camera, in two parts.
@@ -36,6 +39,7 @@ impl Soils {
             level: [0; MOST],
             shrink: [1.0; MOST],
             told: [0.0; MOST],
+            whole: [0; MOST],
             wide: 0,
             eye: [high, (eye_z - f64::from(high)) as f32],
         }
@@ -48,7 +52,9 @@ impl Soils {
         self.level[lane] = level as i32;
         let shrink = 1.0 / (1u32 << level) as f32;
         self.shrink[lane] = shrink;
-        self.told[lane] = if tile.has_voids() { f32::INFINITY } else { apart * shrink };
+        let holed = tile.has_voids();
+        self.told[lane] = if holed { f32::INFINITY } else { apart * shrink };
+        self.whole[lane] = if holed { 0 } else { WHOLE };
         match tile.heights() {
             Heights::Codes(codes) => {
                 let eye_z = f64::from(self.eye[0]) + f64::from(self.eye[1]);
@@ -67,6 +73,15 @@ impl Soils {
                 (self.base[lane], self.step[lane]) = (0.0, 1.0);
             }
         }
+    }
+
+    /// Inverse depths with their last bits set to [`WHOLE`] and [`TOLD`].
+    #[inline(always)]
+    pub fn marked<L: Lanes>(&self, answer: L::F) -> L::F {
+        let told = L::F::load(&self.told).le(answer);
+        let told = L::I::select(told, L::I::splat(TOLD), L::I::splat(0));
+        let bits = answer.to_bits() & L::I::splat(!(WHOLE | TOLD));
+        L::F::from_bits(bits + L::I::load(&self.whole) + told)
     }
 
     /// Height over the camera of values between posts.
