@@ -27,7 +27,7 @@ use crate::seen::Seen;
 use crate::walk::{Fineness, Lines, Rows, Walk};
 use doubts::{Doubts, SKY};
 use glam::DVec2;
-use net::{BENT, BROKEN, Bends, Net};
+use net::{BENT, BROKEN, Bends, Net, OPEN};
 pub(crate) use net::{TOLD, WHOLE};
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
@@ -311,9 +311,11 @@ impl Columns<'_, '_> {
                 let (a, b) = gathered::<L>(answers, left);
                 (a, b, gathered::<L>(states, left).0)
             };
-            let answer = a + (b - a) * share;
+            let open = L::F::splat(OPEN).eq(state);
+            let answer = L::F::select(open, L::F::splat(f32::NAN), a + (b - a) * share);
             let count = L::N.min((pixels.end - pixel) as usize);
-            let doubtful = L::F::splat(BENT).le(state).bits() & (u32::MAX >> (32 - count));
+            let doubtful = L::F::splat(BENT).le(state) & !open;
+            let doubtful = doubtful.bits() & (u32::MAX >> (32 - count));
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
@@ -368,9 +370,6 @@ impl Columns<'_, '_> {
 /// Where a pixel may see ground between two rays that see different ground, or on a closer
 /// one that ends a little lower.
 fn broken([a, b]: [f32; 2], tip: Option<f32>) -> [f32; 3] {
-    if a.is_nan() || b.is_nan() {
-        return [0.0; 3];
-    }
     let whole = |answer: f32| answer.to_bits() as i32 & WHOLE != 0;
     // Behind voids there may be any ground, not just one of the two.
     let far = if whole(a) && whole(b) { a.min(b) } else { 0.0 };

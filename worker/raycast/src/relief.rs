@@ -140,14 +140,14 @@ impl<'a> Relief<'a> {
     }
 
     /// The surface under places on the map, metres from the camera: whether there is any,
-    /// its height over the camera, and its slopes along x and y. What it takes of a tile
-    /// that is not loaded is not there.
+    /// whether that is unknown for lack of a tile, its height over the camera, and its slopes
+    /// along x and y.
     #[inline(always)]
     pub(crate) fn surface<L: Lanes>(
         &self,
         place: [L::F; 2],
         lanes: L::M,
-    ) -> (L::M, L::F, [L::F; 2]) {
+    ) -> (L::M, L::M, L::F, [L::F; 2]) {
         let zero = L::F::splat(0.0);
         let scale = [0, 1].map(|axis| (1.0 / self.spacing[axis]) as f32);
         let x = L::F::splat(self.eye_place[0]) + place[0] * L::F::splat(scale[0]);
@@ -161,7 +161,8 @@ impl<'a> Relief<'a> {
             & cell_y.lt(L::I::splat(self.cells[1]));
         let bits = L::I::splat(MAXIMA_LEVELS as i32);
         let plots = cell_y.shr(bits).times(L::I::splat(self.plots[0])) + cell_x.shr(bits);
-        let (mut solid, mut height, mut slopes) = (L::M::none(), zero, [zero; 2]);
+        let (mut solid, mut absent) = (L::M::none(), L::M::none());
+        let (mut height, mut slopes) = (zero, [zero; 2]);
         let mut left = lanes & inside;
         let mut numbers = [0; MOST];
         plots.store(&mut numbers);
@@ -169,7 +170,15 @@ impl<'a> Relief<'a> {
             let number = numbers[left.bits().trailing_zeros() as usize % MOST];
             let here = left & plots.eq(L::I::splat(number));
             left = left & !here;
-            let Plot { ground: Soil::Tile(tile), level, .. } = self.plot(number) else { continue };
+            let Plot { ground, level, .. } = self.plot(number);
+            let tile = match ground {
+                Soil::Tile(tile) => tile,
+                Soil::Void => continue,
+                Soil::Absent => {
+                    absent = absent | here;
+                    continue;
+                }
+            };
             let base = L::I::splat(level as i32);
             let shrink = L::F::splat(1.0 / (1u32 << level) as f32);
             let (i, j) = (cell_x.shr(base), cell_y.shr(base));
@@ -187,7 +196,7 @@ impl<'a> Relief<'a> {
             slopes[1] = L::F::select(here, slope_y, slopes[1]);
             solid = solid | (here & there);
         }
-        (solid, height, slopes)
+        (solid, absent, height, slopes)
     }
 
     /// Tiles that were needed but not loaded, sorted, each once.

@@ -96,17 +96,19 @@ impl Columns<'_, '_> {
             }
             let all = L::M::from_bits(u32::MAX >> (32 - L::N.min(count - at)));
             let (zero, sky) = (L::F::splat(0.0), L::F::splat(SKY));
-            let (mut answer, mut sure) = (zero, L::M::none());
+            let (mut answer, mut sure, mut open) = (zero, L::M::none(), all);
             for guesses in &doubts.guesses {
                 let guess = L::F::load(&guesses[at..]);
-                let next = all & !sure & zero.lt(guess);
+                let next = open & zero.lt(guess);
                 if next.any() {
-                    let (found, settled) = self.settle::<L>(ray, guess, next);
+                    let (found, settled, unknown) = self.settle::<L>(ray, guess, next);
                     answer = L::F::select(next & settled, found, answer);
                     sure = sure | (next & settled);
+                    open = open & !settled & !unknown;
                 }
                 // The answer then is 0.
-                sure = sure | (all & guess.eq(sky));
+                sure = sure | (open & guess.eq(sky));
+                open = open & !sure;
             }
             let places = (y - top).times(L::I::splat(self.region.width as i32)) + (x - left);
             answer.scatter(inverse_depth, places, all);
@@ -128,9 +130,9 @@ impl Columns<'_, '_> {
     }
 
     /// Moves guesses along rays until they are on the surface, where it faces the camera.
-    /// Returns which have got there.
+    /// Returns which have got there, and which came to a tile that is not loaded.
     #[inline(always)]
-    fn settle<L: Lanes>(&self, ray: [L::F; 3], guess: L::F, lanes: L::M) -> (L::F, L::M) {
+    fn settle<L: Lanes>(&self, ray: [L::F; 3], guess: L::F, lanes: L::M) -> (L::F, L::M, L::M) {
         let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
         let [x, y, z] = ray;
         let across = x * x + y * y;
@@ -138,9 +140,12 @@ impl Columns<'_, '_> {
         let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
         let allowed = L::F::splat((allowed * allowed) as f32) * (across + z * z);
         let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
+        let mut unknown = L::M::none();
         for _ in 0..CORRECTIONS {
             let depth = one.div(answer);
-            let (solid, ground, slopes) = self.relief.surface::<L>([x * depth, y * depth], left);
+            let (solid, absent, ground, slopes) =
+                self.relief.surface::<L>([x * depth, y * depth], left);
+            unknown = unknown | absent;
             let (height, rise) = if self.relief.curvature == 0.0 {
                 (z * depth, z)
             } else {
@@ -163,6 +168,6 @@ impl Columns<'_, '_> {
             left = left & near;
             answer = L::F::select(left, corrected, answer);
         }
-        (answer, sure)
+        (answer, sure, unknown)
     }
 }

@@ -14,6 +14,8 @@ pub(super) const BENT: f32 = 1.0;
 pub(super) const BROKEN: f32 = 2.0;
 /// ... or ground that is closer than what both see ends a few rows below.
 pub(super) const BEHIND: f32 = 3.0;
+/// ... or nothing, for a ray around them waits for a tile.
+pub(super) const OPEN: f32 = 4.0;
 
 /// The last bits of an answer: the tile that it lies on has no void, and ...
 pub(crate) const WHOLE: i32 = 2;
@@ -160,6 +162,7 @@ impl Net {
         let told = L::I::splat(TOLD);
         let (flat, uneven) = (L::F::splat(EVEN), L::F::splat(BENT));
         let (broken, behind) = (L::F::splat(BROKEN), L::F::splat(BEHIND));
+        let open = L::F::splat(OPEN);
         for row in (0..count).step_by(width.max(1)) {
             // The rows beside this one, or one of them twice.
             let after = if row + width < count { row + width } else { row.saturating_sub(width) };
@@ -169,7 +172,10 @@ impl Net {
                 let (a, b) = (load(here), load(here + 1));
                 let (low, high) = (a.min(b), a.max(b));
                 let same = (high * neighbours).le(low);
-                let bend = L::F::load(&bends[here..]).max(L::F::load(&bends[here + 1..]));
+                let (bend_a, bend_b) = (L::F::load(&bends[here..]), L::F::load(&bends[here + 1..]));
+                let bend = bend_a.max(bend_b);
+                let around = (load(before) + load(before + 1)) + (load(after) + load(after + 1));
+                let known = bend_a + bend_b + around;
                 let change = (a - load(before)).abs().min((b - load(before + 1)).abs());
                 let change = change.min((a - load(after)).abs().min((b - load(after + 1)).abs()));
                 let even = (change * of_change).max(low * of_depth);
@@ -180,6 +186,7 @@ impl Net {
                 let state = L::F::select(even, flat, uneven);
                 let state = L::F::select(same, state, broken);
                 let state = L::F::select(high.lt(tip * neighbours), behind, state);
+                let state = L::F::select(known.eq(known), state, open);
                 state.store(&mut states[here..]);
             }
         }
