@@ -284,11 +284,11 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let lane = bits.trailing_zeros() as usize % MOST;
             bits &= bits - 1;
             let plot = self.relief.plot(plots[lane]);
-            match plot.ground {
-                Soil::Tile(tile) => {
+            match &plot.ground {
+                Soil::Loaded(loaded) => {
                     inside |= 1 << lane;
                     let spacing = self.relief.spacing[0].min(self.relief.spacing[1]) as f32;
-                    soil.set(lane, tile, plot.level, self.fineness.apart / spacing);
+                    soil.set(lane, loaded, plot.level, self.fineness.apart / spacing);
                 }
                 Soil::Void => {}
                 Soil::Absent => unsure |= 1 << lane,
@@ -296,6 +296,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         }
         self.unsure = self.unsure | L::M::from_bits(unsure);
         let inside = L::M::from_bits(inside);
+        self.lines.next[1] = soil.row::<L>(self.lines.forward[1]);
         let passing = lanes & !inside;
         if passing.any() {
             let level = L::I::splat(MAXIMA_LEVELS as i32);
@@ -487,7 +488,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let entry = entries[axis].eq(start);
             from[axis] = L::F::select(entry, known, share.max(none).min(full));
         }
-        self.steps.post = L::I::select(lanes, post::<L>(self.cell), self.steps.post);
+        self.steps.post = L::I::select(lanes, soil.post::<L>(self.cell), self.steps.post);
         self.steps.passed = L::I::select(lanes, L::I::splat(0), self.steps.passed);
         let (_, [sw, se, nw, ne]) = soil.corners::<L>(self.steps.post, lanes);
         // On an edge exactly what the cell on its other side has: between two posts.

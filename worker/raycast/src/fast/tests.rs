@@ -286,7 +286,7 @@ fn levels_that_cannot_be_compared_are_not_used_and_the_finest_is() {
         view.quality.tolerance_px = 8.0;
         let (seen, missing) = see(field, &view, Region::whole(80, 60), method, Width::One).unwrap();
         assert_eq!(missing, []);
-        let relief = Relief::new(field, &view, 8.0);
+        let relief = Relief::new(field, &view, 8.0, Lack::Open);
         let levels: Vec<u32> =
             (0..relief.plots[0] * relief.plots[1]).map(|plot| relief.plot(plot).level).collect();
         assert!(levels.iter().all(|level| *level == 0), "{levels:?}");
