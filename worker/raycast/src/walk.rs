@@ -112,6 +112,8 @@ struct Steps<L: Lanes> {
     rest: [L::I; 2],
     /// Place of the cell's south-west post in the tile.
     post: L::I,
+    /// What to add to it to come to the next post along y.
+    row: L::I,
     /// Cells passed since the last hit.
     passed: L::I,
 }
@@ -166,6 +168,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 crossing: [none; 2],
                 rest: [zero; 2],
                 post: zero,
+                row: zero,
                 passed: zero,
             },
             profile: Profile::new(),
@@ -296,7 +299,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         }
         self.unsure = self.unsure | L::M::from_bits(unsure);
         let inside = L::M::from_bits(inside);
-        self.lines.next[1] = soil.row::<L>(self.lines.forward[1]);
+        self.steps.row = soil.row::<L>(self.lines.forward[1]);
         let passing = lanes & !inside;
         if passing.any() {
             let level = L::I::splat(MAXIMA_LEVELS as i32);
@@ -372,7 +375,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let line_y = steps.line[1] + self.lines.sign[1] * side;
         steps.line[0] = L::F::select(by_x, line_x, steps.line[0]);
         steps.line[1] = L::F::select(by_y, line_y, steps.line[1]);
-        let next = steps.post + L::I::select(along_x, self.lines.next[0], self.lines.next[1]);
+        let next = steps.post + L::I::select(along_x, self.lines.next, steps.row);
         steps.post = L::I::select(walking, next, steps.post);
         steps.passed = L::I::select(walking, steps.passed + one, steps.passed);
         let mut tired = walking & !leaving & L::I::splat(PATIENCE).lt(steps.passed);
