@@ -72,8 +72,7 @@ impl Patch {
         let mut heights = vec![0.0f32; side * side];
         let mut extents = Extents::new(side);
         let (mut own, mut up) = (vec![0.0f32; side], vec![0.0f32; side]);
-        let mut south = vec![0.0f32; half];
-        let mut north = vec![0.0f32; half];
+        let [mut south, mut north, mut middle] = [(); 3].map(|()| vec![0.0f32; half]);
         read(coarse, below, origin, &mut north);
         for (row, heights) in heights.chunks_exact_mut(side).enumerate() {
             read(fine, [at[0], at[1] + row], origin, &mut own);
@@ -84,9 +83,8 @@ impl Patch {
                 }
                 spread(&south, &mut up);
             } else {
-                let mut middle = south.clone();
-                for (post, north) in middle.iter_mut().zip(&north) {
-                    *post = 0.5 * (*post + *north);
+                for ((middle, south), north) in middle.iter_mut().zip(&south).zip(&north) {
+                    *middle = 0.5 * (south + north);
                 }
                 spread(&middle, &mut up);
             }
