@@ -4,11 +4,15 @@
 //! ray pass over ground of which not a single tile is loaded.
 
 use crate::claims;
+use crate::relief::patches::Patches;
+use std::sync::Arc;
 use terrafarm_terrain::layout::{Layer, LayerKind, StoreIndex};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
 /// What rays need to know of a store's index: maxima above the tiles, for every height
-/// layer, and whether its deviations can be believed. Built once for a store.
+/// layer, and whether its deviations can be believed. Built once for a store; clones
+/// share what was worked out of its tiles for one picture and may serve the next, at most
+/// 64 MiB.
 #[derive(Debug, Clone)]
 pub struct Pyramid {
     /// As the layers of the index; photo layers have no levels.
@@ -17,6 +21,7 @@ pub struct Pyramid {
     highest: f64,
     /// Whether the deviations of the first height layer can be believed.
     pub(crate) deviations_hold: bool,
+    patches: Arc<Patches>,
 }
 
 /// Maxima above the tiles of one layer.
@@ -52,7 +57,7 @@ impl Pyramid {
         }
         let first = index.layers_of(LayerKind::Height).next();
         let deviations_hold = first.is_none_or(|(_, layer)| claims::hold(layer));
-        Pyramid { layers, lowest, highest, deviations_hold }
+        Pyramid { layers, lowest, highest, deviations_hold, patches: Arc::new(Patches::new()) }
     }
 
     /// Lowest height of the terrain, metres.
@@ -63,6 +68,11 @@ impl Pyramid {
     /// Highest height of the terrain, metres.
     pub fn highest(&self) -> f64 {
         self.highest
+    }
+
+    /// Plots between two levels.
+    pub(crate) fn patches(&self) -> &Patches {
+        &self.patches
     }
 
     pub(crate) fn layer(&self, layer: usize) -> &LayerMaxima {

@@ -8,26 +8,37 @@
 //! from level 0, in pixels across the line of sight. Which level a plot has depends on the
 //! view alone, not on the ray.
 //!
+//! On the way from one level to the next a plot is seen at a mean of both (`patch`), which
+//! keeps the same bound, so that it changes little by little as the camera moves.
+//!
 //! Where the tile of a plot is not loaded, a picture that can wait leaves the plot open and
 //! names the tile. One that cannot ([`Lack::Coarser`]) sees the plot at the finest coarser
 //! level whose tile is loaded: where the ground of level 0 is, that of every coarser level
-//! is, too, so there is no hole. Such plots are counted.
+//! is, too, so there is no hole. Such plots are counted. Where no more than the coarser tile
+//! of a mean is not loaded, it sees the finer one as it is.
+
+mod patch;
+pub(crate) mod patches;
+mod posts;
+
+pub(crate) use posts::{Kept, Loaded};
 
 use crate::View;
 use crate::field::Field;
 use crate::grid::cells_of;
-use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, as_bits};
+use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use crate::path::Ground;
-use crate::walk::post;
-use std::cell::RefCell;
+use patch::Patch;
+use patches::{Blend, Patches};
+use std::cell::{Cell, OnceCell, RefCell};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
-use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TILE_POSTS, TileKey};
+use terrafarm_terrain::layout::{Layer, LayerKind, TILE_CELLS, TileKey};
 use terrafarm_terrain::resident::Lookup;
-use terrafarm_terrain::tile::{HeightTile, Heights, MAXIMA_LEVELS, VOID};
+use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
-/// A plot that nobody has asked for yet.
-const UNKNOWN: u32 = u32::MAX;
+/// Plots that are known together: of large stores only a few are ever asked for.
+const GROUP: usize = 64;
 
 /// What becomes of a plot whose tile is not loaded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,21 +69,19 @@ pub(crate) struct Relief<'a> {
     /// Plots along x and y.
     pub plots: [i32; 2],
     lack: Lack,
-    known: RefCell<Known<'a>>,
+    /// By number, [`GROUP`] at a time.
+    known: Vec<OnceCell<Group<'a>>>,
+    patches: &'a Patches,
+    wanted: RefCell<Vec<TileKey>>,
+    /// Some plot is seen at a coarser level than it should be.
+    any_coarser: Cell<bool>,
 }
 
-/// The plots that rays have come to.
-struct Known<'a> {
-    /// By plot, row by row from the south-west, its place in `plots`.
-    places: Vec<u32>,
-    plots: Vec<Plot<'a>>,
-    wanted: Vec<TileKey>,
-    /// Some plot is seen at a coarser level than it should be.
-    any_coarser: bool,
-}
+/// Plots, those known that rays have come to.
+type Group<'a> = Box<[OnceCell<Plot<'a>>; GROUP]>;
 
 /// How a plot is seen.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 pub(crate) struct Plot<'a> {
     pub ground: Soil<'a>,
     /// Level, 0 the finest.
@@ -81,10 +90,10 @@ pub(crate) struct Plot<'a> {
     coarser: bool,
 }
 
-/// The tile under a plot.
-#[derive(Clone, Copy)]
+/// What is under a plot.
+#[derive(Clone)]
 pub(crate) enum Soil<'a> {
-    Tile(&'a HeightTile),
+    Loaded(Loaded<'a>),
     /// Nothing to hit.
     Void,
     /// Not loaded.
@@ -104,12 +113,7 @@ impl<'a> Relief<'a> {
         });
         let cell = place.map(f64::floor);
         let plots = cells.map(|count| (count - 1) / TILE_CELLS as i32 + 1);
-        let known = Known {
-            places: vec![UNKNOWN; plots[0] as usize * plots[1] as usize],
-            plots: Vec::new(),
-            wanted: Vec::new(),
-            any_coarser: false,
-        };
+        let groups = (plots[0] as usize * plots[1] as usize).div_ceil(GROUP);
         Relief {
             field,
             number,
@@ -123,20 +127,19 @@ impl<'a> Relief<'a> {
             curvature: Ground::new(view.shading.earth).curvature(),
             plots,
             lack,
-            known: RefCell::new(known),
+            known: std::iter::repeat_with(OnceCell::new).take(groups).collect(),
+            patches: field.pyramid.patches(),
+            wanted: RefCell::default(),
+            any_coarser: Cell::new(false),
         }
     }
 
     /// The plot with a number: `row * plots[0] + column`.
     #[inline]
-    pub(crate) fn plot(&self, number: i32) -> Plot<'a> {
-        let known = self.known.borrow();
-        let place = known.places[number as usize];
-        if place != UNKNOWN {
-            return known.plots[place as usize];
-        }
-        drop(known);
-        self.meet(number)
+    pub(crate) fn plot(&self, number: i32) -> &Plot<'a> {
+        let (group, place) = (number as usize / GROUP, number as usize % GROUP);
+        let group = self.known[group].get_or_init(|| Box::new([const { OnceCell::new() }; GROUP]));
+        group[place].get_or_init(|| self.meet(number))
     }
 
     /// The surface under places on the map, metres from the camera: whether there is any,
@@ -170,22 +173,22 @@ impl<'a> Relief<'a> {
             let number = numbers[left.bits().trailing_zeros() as usize % MOST];
             let here = left & plots.eq(L::I::splat(number));
             left = left & !here;
-            let Plot { ground, level, .. } = self.plot(number);
-            let tile = match ground {
-                Soil::Tile(tile) => tile,
+            let plot = self.plot(number);
+            let loaded = match &plot.ground {
+                Soil::Loaded(loaded) => loaded,
                 Soil::Void => continue,
                 Soil::Absent => {
                     absent = absent | here;
                     continue;
                 }
             };
-            let base = L::I::splat(level as i32);
-            let shrink = L::F::splat(1.0 / (1u32 << level) as f32);
+            let base = L::I::splat(plot.level as i32);
+            let shrink = L::F::splat(1.0 / (1u32 << plot.level) as f32);
             let (i, j) = (cell_x.shr(base), cell_y.shr(base));
             let corner_x = (i.shl(base) - L::I::splat(self.eye_cell[0])).to_floats();
             let corner_y = (j.shl(base) - L::I::splat(self.eye_cell[1])).to_floats();
             let (u, v) = ((x - corner_x) * shrink, (y - corner_y) * shrink);
-            let (there, [sw, se, nw, ne]) = corners::<L>(tile, self.eye_z, [i, j], here);
+            let (there, [sw, se, nw, ne]) = loaded.posts().corners::<L>(self.eye_z, [i, j], here);
             let (south, north) = (se - sw, ne - nw);
             let (low, high) = (sw + south * u, nw + north * u);
             let found = low + (high - low) * v;
@@ -201,7 +204,7 @@ impl<'a> Relief<'a> {
 
     /// Tiles that were needed but not loaded, sorted, each once.
     pub(crate) fn wanted(&self) -> Vec<TileKey> {
-        let mut wanted = self.known.borrow().wanted.clone();
+        let mut wanted = self.wanted.borrow().clone();
         wanted.sort_unstable();
         wanted.dedup();
         wanted
@@ -215,7 +218,7 @@ impl<'a> Relief<'a> {
         region: Region,
         inverse_depth: &[f32],
     ) -> u64 {
-        if !self.known.borrow().any_coarser {
+        if !self.any_coarser.get() {
             return 0;
         }
         let shown = region.pixels().zip(inverse_depth).filter(|(_, inverse)| **inverse > 0.0);
@@ -235,30 +238,53 @@ impl<'a> Relief<'a> {
     #[cold]
     fn meet(&self, number: i32) -> Plot<'a> {
         let at = [number % self.plots[0], number / self.plots[0]];
-        let level = self.level(at);
-        let key = self.key(at, level);
-        let finest = self.layer.entry(0, at[0] as u32, at[1] as u32);
-        let known = &mut *self.known.borrow_mut();
+        let (level, weight) = self.level(at);
         let mut plot = Plot { ground: Soil::Void, level: level as u32, coarser: false };
-        if finest.is_some_and(|entry| !entry.is_empty()) {
-            plot.ground = self.soil(key);
-            if matches!(plot.ground, Soil::Absent) {
-                known.wanted.push(key);
-                if self.lack == Lack::Coarser {
-                    plot = self.coarser(at, level).unwrap_or(plot);
-                    known.any_coarser |= plot.coarser;
-                }
-            }
+        let finest = self.layer.entry(0, at[0] as u32, at[1] as u32);
+        if finest.is_none_or(|entry| entry.is_empty()) {
+            return plot;
         }
-        known.places[number as usize] = known.plots.len() as u32;
-        known.plots.push(plot);
+        plot.ground = self.soil(self.key(at, level));
+        if weight > 0 {
+            self.blend(number, &mut plot, weight);
+        }
+        if matches!(plot.ground, Soil::Absent) && self.lack == Lack::Coarser {
+            plot = self.coarser(at, level).unwrap_or(plot);
+            self.any_coarser.set(self.any_coarser.get() | plot.coarser);
+        }
         plot
     }
 
+    /// Blends a plot with the next coarser level. Where its tile is not loaded, the plot
+    /// stays open, or as it is.
+    fn blend(&self, number: i32, plot: &mut Plot<'a>, weight: u32) {
+        let at = [number % self.plots[0], number / self.plots[0]];
+        let coarse = self.soil(self.key(at, plot.level as usize + 1));
+        let Soil::Loaded(own) = &mut plot.ground else { return };
+        match coarse {
+            Soil::Loaded(coarse) => {
+                let blend = Blend { plot: number, level: plot.level, weight };
+                let make = || Patch::new(at, plot.level, weight, own.tile, coarse.tile);
+                own.patch = Some(self.patches.get(blend, make));
+            }
+            Soil::Absent if self.lack == Lack::Open => plot.ground = Soil::Absent,
+            Soil::Absent | Soil::Void => {}
+        }
+    }
+
+    /// What is loaded of a tile, which is wanted if it is not.
     fn soil(&self, key: TileKey) -> Soil<'a> {
+        let soil = self.at_hand(key);
+        if matches!(soil, Soil::Absent) {
+            self.wanted.borrow_mut().push(key);
+        }
+        soil
+    }
+
+    fn at_hand(&self, key: TileKey) -> Soil<'a> {
         self.field.resident.touch(key);
         match self.field.resident.height(key) {
-            Lookup::Found(tile) => Soil::Tile(tile),
+            Lookup::Found(tile) => Soil::Loaded(Loaded { tile, patch: None }),
             Lookup::Empty => Soil::Void,
             Lookup::Absent => Soil::Absent,
         }
@@ -267,8 +293,8 @@ impl<'a> Relief<'a> {
     /// A plot at the finest of the levels coarser than this one whose tile is loaded.
     fn coarser(&self, plot: [i32; 2], level: usize) -> Option<Plot<'a>> {
         (level + 1..=self.layer.root_level()).find_map(|level| {
-            let ground = self.soil(self.key(plot, level));
-            let loaded = matches!(ground, Soil::Tile(_));
+            let ground = self.at_hand(self.key(plot, level));
+            let loaded = matches!(ground, Soil::Loaded(_));
             loaded.then_some(Plot { ground, level: level as u32, coarser: true })
         })
     }
@@ -279,15 +305,25 @@ impl<'a> Relief<'a> {
         TileKey { layer: self.number as u16, level: level as u16, tx, ty }
     }
 
-    /// The level at which a plot is seen.
-    fn level(&self, plot: [i32; 2]) -> usize {
+    /// The level at which a plot is seen, and the weight of the next coarser one.
+    fn level(&self, plot: [i32; 2]) -> (usize, u32) {
         let allowed = self.tolerance * self.distance(plot);
-        let fits = |&level: &usize| {
+        let entry = |level: usize| {
             let key = self.key(plot, level);
-            let entry = self.layer.entry(level, key.tx, key.ty);
-            entry.is_some_and(|entry| f64::from(entry.deviation) <= allowed)
+            self.layer.entry(level, key.tx, key.ty)
         };
-        (1..=self.layer.root_level()).take_while(fits).last().unwrap_or(0)
+        let fits = |&level: &usize| {
+            entry(level).is_some_and(|entry| f64::from(entry.deviation) <= allowed)
+        };
+        let root = self.layer.root_level();
+        let level = (1..=root).take_while(fits).last().unwrap_or(0);
+        let pair = entry(level).zip((level < root).then(|| entry(level + 1)).flatten());
+        let weight = pair.map_or(0, |(fine, coarse)| {
+            let extent = f64::from(fine.max.max(coarse.max)) - f64::from(fine.min.min(coarse.min));
+            let deviations = [fine.deviation, coarse.deviation].map(f64::from);
+            patch::weight(allowed, deviations, extent)
+        });
+        (level, weight)
     }
 
     /// Distance from the camera to the box of a plot, metres.
@@ -310,55 +346,5 @@ impl<'a> Relief<'a> {
     }
 }
 
-/// Whether cells have ground, and the heights of their corners over the camera: south-west,
-/// south-east, north-west, north-east.
-#[inline(always)]
-fn corners<L: Lanes>(
-    tile: &HeightTile,
-    eye_z: f64,
-    cell: [L::I; 2],
-    lanes: L::M,
-) -> (L::M, [L::F; 4]) {
-    let at = post::<L>(cell);
-    let north = at + L::I::splat(TILE_POSTS as i32);
-    match tile.heights() {
-        Heights::Codes(codes) => {
-            let base = L::F::splat((f64::from(codes.base) * codes.step - eye_z) as f32);
-            let step = L::F::splat(codes.step as f32);
-            let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
-            let south = L::I::gather_pairs(codes.posts, at, lanes);
-            let north = L::I::gather_pairs(codes.posts, north, lanes);
-            let (sw, se) = (south & low, south.shr(sixteen) & low);
-            let (nw, ne) = (north & low, north.shr(sixteen) & low);
-            let there = sw.max(se).max(nw.max(ne)).lt(L::I::splat(i32::from(VOID)));
-            let heights = [
-                base + sw.to_floats() * step,
-                base + se.to_floats() * step,
-                base + nw.to_floats() * step,
-                base + ne.to_floats() * step,
-            ];
-            (there, heights)
-        }
-        Heights::Floats(floats) => {
-            let posts = as_bits(floats.posts);
-            let high = eye_z as f32;
-            let eye = [L::F::splat(high), L::F::splat((eye_z - f64::from(high)) as f32)];
-            let one = L::I::splat(1);
-            let [sw, se, nw, ne] = [
-                L::I::gather(posts, at, lanes),
-                L::I::gather(posts, at + one, lanes),
-                L::I::gather(posts, north, lanes),
-                L::I::gather(posts, north + one, lanes),
-            ];
-            let heights = [
-                L::F::from_bits(sw) - eye[0] - eye[1],
-                L::F::from_bits(se) - eye[0] - eye[1],
-                L::F::from_bits(nw) - eye[0] - eye[1],
-                L::F::from_bits(ne) - eye[0] - eye[1],
-            ];
-            // A void is NaN, and so is any sum with it.
-            let sum = heights[0] + heights[1] + heights[2] + heights[3];
-            (sum.eq(sum), heights)
-        }
-    }
-}
+#[cfg(test)]
+mod tests;

@@ -113,6 +113,8 @@ struct Steps<L: Lanes> {
     rest: [L::I; 2],
     /// Place of the cell's south-west post in the tile.
     post: L::I,
+    /// What to add to it to come to the next post along y.
+    row: L::I,
     /// Cells passed since the last hit.
     passed: L::I,
 }
@@ -167,6 +169,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 crossing: [none; 2],
                 rest: [zero; 2],
                 post: zero,
+                row: zero,
                 passed: zero,
             },
             profile: Profile::new(),
@@ -283,11 +286,11 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let lane = bits.trailing_zeros() as usize % MOST;
             bits &= bits - 1;
             let plot = self.relief.plot(plots[lane]);
-            match plot.ground {
-                Soil::Tile(tile) => {
+            match &plot.ground {
+                Soil::Loaded(loaded) => {
                     inside |= 1 << lane;
                     let spacing = self.relief.spacing[0].min(self.relief.spacing[1]) as f32;
-                    soil.set(lane, tile, plot.level, self.fineness.apart / spacing);
+                    soil.set(lane, loaded, plot.level, self.fineness.apart / spacing);
                 }
                 Soil::Void => {}
                 Soil::Absent => unsure |= 1 << lane,
@@ -295,6 +298,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         }
         self.unsure = self.unsure | L::M::from_bits(unsure);
         let inside = L::M::from_bits(inside);
+        self.steps.row = soil.row::<L>(self.lines.forward[1]);
         let passing = lanes & !inside;
         if passing.any() {
             let level = L::I::splat(MAXIMA_LEVELS as i32);
@@ -370,7 +374,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let line_y = steps.line[1] + self.lines.sign[1] * side;
         steps.line[0] = L::F::select(by_x, line_x, steps.line[0]);
         steps.line[1] = L::F::select(by_y, line_y, steps.line[1]);
-        let next = steps.post + L::I::select(along_x, self.lines.next[0], self.lines.next[1]);
+        let next = steps.post + L::I::select(along_x, self.lines.next, steps.row);
         steps.post = L::I::select(walking, next, steps.post);
         steps.passed = L::I::select(walking, steps.passed + one, steps.passed);
         let mut tired = walking & !leaving & L::I::splat(PATIENCE).lt(steps.passed);
@@ -486,7 +490,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             let entry = entries[axis].eq(start);
             from[axis] = L::F::select(entry, known, share.max(none).min(full));
         }
-        self.steps.post = L::I::select(lanes, post::<L>(self.cell), self.steps.post);
+        self.steps.post = L::I::select(lanes, soil.post::<L>(self.cell), self.steps.post);
         self.steps.passed = L::I::select(lanes, L::I::splat(0), self.steps.passed);
         let (_, [sw, se, nw, ne]) = soil.corners::<L>(self.steps.post, lanes);
         // On an edge exactly what the cell on its other side has: between two posts.

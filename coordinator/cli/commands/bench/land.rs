@@ -18,7 +18,7 @@ use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder
 use terrafarm_terrain::layout::{
     HeightDatum, ImportReport, Layer, LayerKind, Level, StoreIndex, TILE_CELLS, TileEntry, TileKey,
 };
-use terrafarm_terrain::resident::Resident;
+use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::sample::Sampler;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_terrain::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
@@ -252,6 +252,17 @@ impl Land {
         }
         let pyramid = Pyramid::new(&index);
         Ok(Land { name, store, resident, pyramid, height_bytes, _folder: folder })
+    }
+
+    /// All of its tiles, read anew.
+    pub fn tiles(&self) -> anyhow::Result<Vec<(TileKey, Tile)>> {
+        let mut tiles = Vec::new();
+        for key in keys(self.store.index(), Load::All) {
+            if let Some(tile) = self.store.read_tile(key)? {
+                tiles.push((key, tile));
+            }
+        }
+        Ok(tiles)
     }
 
     /// The Earth under it; flat if the store lies nowhere on it.

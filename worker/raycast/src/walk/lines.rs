@@ -2,7 +2,6 @@
 
 use crate::lanes::{Floats, Ints, Lanes, Mask};
 use crate::relief::Relief;
-use terrafarm_terrain::layout::TILE_POSTS;
 
 /// The least part of a line's direction along an axis: what is less runs along the grid.
 const ALONG_GRID: f32 = 1e-12;
@@ -19,8 +18,8 @@ pub(crate) struct Lines<L: Lanes> {
     pub forward: [L::M; 2],
     /// ... and as 1 or -1.
     pub sign: [L::F; 2],
-    /// What to add to the place of a post to come to the next along an axis.
-    pub next: [L::I; 2],
+    /// What to add to the place of a post to come to the next along x.
+    pub next: L::I,
     /// Distance at which the line comes over the layer ...
     pub enter: L::F,
     /// ... and leaves it.
@@ -45,7 +44,7 @@ impl<L: Lanes> Lines<L> {
             ahead: [L::I::splat(0); 2],
             forward: [L::M::none(); 2],
             sign: direction,
-            next: [L::I::splat(0); 2],
+            next: L::I::splat(0),
             enter: L::F::splat(0.0),
             leave: L::F::splat(f32::INFINITY),
         };
@@ -59,13 +58,12 @@ impl<L: Lanes> Lines<L> {
             lines.ahead[axis] = L::I::select(ahead, L::I::splat(1), L::I::splat(0));
             lines.forward[axis] = ahead;
             lines.sign[axis] = L::F::select(ahead, L::F::splat(1.0), L::F::splat(-1.0));
-            let stride = [1, TILE_POSTS as i32][axis];
-            lines.next[axis] = L::I::select(ahead, L::I::splat(stride), L::I::splat(-stride));
             let first = lines.crossing(relief, axis, L::I::splat(0));
             let last = lines.crossing(relief, axis, L::I::splat(relief.cells[axis]));
             lines.enter = lines.enter.max(first.min(last));
             lines.leave = lines.leave.min(first.max(last));
         }
+        lines.next = lines.ahead[0] + lines.ahead[0] - L::I::splat(1);
         lines
     }
 
