@@ -158,6 +158,9 @@ pub fn draw(title: &Title, panels: &[Panel; 2]) -> Drawing {
     drawing
 }
 
+/// From so many decades on, only decades have a number.
+const MANY_DECADES: f64 = 2.5;
+
 /// A logarithmic axis between two values.
 #[derive(Clone, Copy)]
 struct Axis {
@@ -179,6 +182,11 @@ impl Axis {
     /// Place of a value, 0 to 1.
     fn share(&self, value: f64) -> f64 {
         (libm::log(value) - libm::log(self.low)) / (libm::log(self.high) - libm::log(self.low))
+    }
+
+    /// How many decades it spans.
+    fn decades(&self) -> f64 {
+        libm::log10(self.high) - libm::log10(self.low)
     }
 
     /// 1, 2 and 5 of every decade in range, and whether it is a 1.
@@ -251,7 +259,9 @@ impl Drawing {
         for (value, is_decade) in across.ticks() {
             let x = left + across.share(value) * PANEL_WIDTH;
             self.line(vec![[x, PANEL_TOP], [x, bottom]], if is_decade { 1.4 } else { 0.7 }, GRID);
-            self.text([x, bottom + 20.0], SMALL, Anchor::Middle, INK, &tick(value));
+            if is_decade || across.decades() < MANY_DECADES {
+                self.text([x, bottom + 20.0], SMALL, Anchor::Middle, INK, &time(value));
+            }
         }
         for (value, is_decade) in up.ticks() {
             let y = PANEL_TOP + (1.0 - up.share(value)) * PANEL_HEIGHT;
@@ -259,7 +269,7 @@ impl Drawing {
             self.text([left - 8.0, y + 4.0], SMALL, Anchor::End, INK, &tick(value));
         }
         self.line(vec![[left, PANEL_TOP], [left, bottom], [right, bottom]], 1.4, INK);
-        let name = "time per frame (ms of one core)";
+        let name = "time per frame, on one core";
         self.text([left + PANEL_WIDTH / 2.0, bottom + 46.0], TEXT, Anchor::Middle, INK, name);
         self.shapes.push(Shape::Text {
             at: [left - 58.0, PANEL_TOP + PANEL_HEIGHT / 2.0],
@@ -274,7 +284,7 @@ impl Drawing {
             self.text([left, bottom + 72.0], SMALL, Anchor::Start, GREY, &note);
         }
         // The arrow to the better.
-        let tip = [left + 26.0, bottom - 26.0];
+        let tip = [left + 0.55 * PANEL_WIDTH, PANEL_TOP + 0.45 * PANEL_HEIGHT];
         self.line(vec![[tip[0] + 46.0, tip[1] - 46.0], tip], 2.2, GREY);
         self.line(vec![[tip[0] + 14.0, tip[1]], tip, [tip[0], tip[1] - 14.0]], 2.2, GREY);
         self.text([tip[0] + 52.0, tip[1] - 48.0], TEXT, Anchor::Start, GREY, "better");
@@ -368,6 +378,11 @@ impl Drawing {
         }
         false
     }
+}
+
+/// A time of an axis, milliseconds.
+fn time(ms: f64) -> String {
+    if ms < 1000.0 { format!("{} ms", tick(ms)) } else { format!("{} s", tick(ms / 1000.0)) }
 }
 
 /// A number of an axis without needless zeros.
