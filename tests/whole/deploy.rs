@@ -328,6 +328,19 @@ fn nothing_that_a_far_shell_would_understand_gets_into_its_command_line() {
 }
 
 #[test]
+fn files_that_the_readme_starts_exist() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let readme = fs::read_to_string(root.join("README.md")).unwrap();
+    let lines = readme.lines().filter(|line| !line.starts_with('|') && line.contains("deploy/"));
+    let words = lines.flat_map(str::split_whitespace);
+    let files: Vec<_> = words.filter(|word| word.starts_with("deploy/")).collect();
+    assert!(files.len() >= 7, "{files:?}");
+    for file in files {
+        assert!(root.join(file).exists(), "{file}");
+    }
+}
+
+#[test]
 fn the_example_of_a_hosts_file_is_one() {
     let office = Office::new();
     let hosts = deploy("ssh/hosts.example");
