@@ -37,3 +37,13 @@ mod documents;
 /// What is visible, against other programs.
 #[path = "whole/oracles.rs"]
 mod oracles;
+
+/// What `deploy/` starts: units, the ssh launcher, manifests.
+#[cfg(unix)]
+#[path = "whole/deploy.rs"]
+mod deploy;
+
+/// Workers as jobs of a real Slurm.
+#[cfg(target_os = "linux")]
+#[path = "whole/slurm.rs"]
+mod slurm;

@@ -99,6 +99,8 @@ fn start_worker(address: SocketAddr, number: u32, threads: u32) -> anyhow::Resul
         // The store is on this PC already: a second copy on disk would serve nobody.
         .args(["--cache-limit", "0"])
         .arg("--once")
+        // Whoever started this process is not told about its children.
+        .env_remove("NOTIFY_SOCKET")
         .stdin(Stdio::null())
         .stdout(Stdio::null())
         .kill_on_drop(true)

@@ -1,6 +1,6 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
-use crate::{Outcome, args};
+use crate::{Outcome, args, notify};
 use anyhow::{Context, bail};
 use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -37,7 +37,9 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             ..Config::default()
         };
-        terrafarm_coordinator::run(config, listener, stop_signal()).await?;
+        let stop = stop_signal();
+        notify::ready(&format!("listening on {address}"));
+        terrafarm_coordinator::run(config, listener, told(stop)).await?;
         Ok(Outcome::Done)
     })
 }
@@ -56,7 +58,10 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
         seed: process_seed(),
     };
     runtime()?.block_on(async {
-        terrafarm_worker::run(config, stop_signal()).await?;
+        let stop = stop_signal();
+        // A coordinator that is not there yet is waited for, so the service is up already.
+        notify::ready(&format!("working for {}", config.coordinator));
+        terrafarm_worker::run(config, told(stop)).await?;
         Ok(Outcome::Done)
     })
 }
@@ -70,20 +75,32 @@ pub(super) fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
         .context("cannot start the async runtime")
 }
 
-/// Ends on Ctrl-C, and on SIGTERM where there is such a thing.
-pub async fn stop_signal() {
+/// Passes a signal to stop on, and says so to the service manager.
+async fn told(stop: impl Future<Output = ()>) {
+    stop.await;
+    notify::stopping();
+}
+
+/// Ends on Ctrl-C, and on SIGTERM where there is such a thing. SIGTERM is caught from the
+/// call on, not from the first poll: a process that is init in a container would lose an
+/// early one. Must be called within the runtime.
+pub fn stop_signal() -> impl Future<Output = ()> {
     #[cfg(unix)]
-    {
+    let terminate = {
         use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+        signal(SignalKind::terminate())
+    };
+    async move {
+        #[cfg(unix)]
+        if let Ok(mut terminate) = terminate {
             tokio::select! {
                 _ = terminate.recv() => {}
                 _ = tokio::signal::ctrl_c() => {}
             }
             return;
         }
+        let _ = tokio::signal::ctrl_c().await;
     }
-    let _ = tokio::signal::ctrl_c().await;
 }
 
 /// Different for every process that is started: the worker's incarnation.

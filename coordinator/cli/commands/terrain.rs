@@ -255,7 +255,7 @@ fn cancel_on_interrupt() -> anyhow::Result<Arc<AtomicBool>> {
             else {
                 return;
             };
-            runtime.block_on(super::stop_signal());
+            runtime.block_on(async { super::stop_signal().await });
             raise.store(true, Ordering::Relaxed);
         })
         .context("cannot start a thread")?;
