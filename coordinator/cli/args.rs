@@ -476,9 +476,30 @@ pub struct BenchScaleOut {
     #[arg(long, default_value_t = 200_000, requires = "fake",
         value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     pub jobs: u64,
+    /// Size of the picture
+    #[arg(long, value_parser = parse_size, value_name = "WxH", default_value = "1280x720",
+        conflicts_with = "fake")]
+    pub size: (u32, u32),
+    /// Frames of the flight
+    #[arg(long, default_value_t = 120, conflicts_with = "fake",
+        value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: u32,
+    /// Runs of each number of workers, of which the one in the middle counts
+    #[arg(long, default_value_t = 3, conflicts_with = "fake",
+        value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// Folder that keeps the terrain, and where it is looked for [default: a temporary one]
+    #[arg(long, value_name = "FOLDER", conflicts_with = "fake")]
+    pub stores: Option<PathBuf>,
     /// Few frames or jobs, for a quick look
     #[arg(long)]
     pub short: bool,
+    /// Write the chart as SVG
+    #[arg(long, value_name = "FILE", conflicts_with = "fake")]
+    pub svg: Option<PathBuf>,
+    /// Write the chart as PNG
+    #[arg(long, value_name = "FILE", conflicts_with = "fake")]
+    pub png: Option<PathBuf>,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

@@ -3,7 +3,8 @@
 //! [`run`] is the whole of it. Read in this order: [`session`] decides what to do about
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
-//! the session asks for over one connection; `backoff` says when to try again. A [`sleeper`]
+//! the session asks for over one connection; `backoff` says when to try again, `clock` where the
+//! time goes. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
@@ -12,6 +13,7 @@
 //! answer heartbeats.
 
 mod backoff;
+mod clock;
 pub mod render;
 pub mod session;
 mod shift;

@@ -14,7 +14,7 @@ use terrafarm_common::id::LeaseId;
 use terrafarm_common::region::Region;
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, HandshakeError, LinkError, greet};
-use terrafarm_wire::message::{Done, Goodbye, Grant, Hello, Pong, RenderReport, Role};
+use terrafarm_wire::message::{Done, Goodbye, Grant, Hello, Pong, RenderReport, Role, Timesheet};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpStream;
 use tokio_util::sync::CancellationToken;
@@ -177,7 +177,8 @@ fn answer(held: &Held, spent: Duration) -> Result<Done, LinkError> {
     // A job takes some time, whatever the clock says.
     let cost_us = (spent.as_micros() as u64).max(1);
     let report = RenderReport { cost_us, ..RenderReport::default() };
-    Ok(Done { lease: held.lease, report, check: None, pixels })
+    let timesheet = Timesheet { idle_us: cost_us, ..Timesheet::default() };
+    Ok(Done { lease: held.lease, report, timesheet, check: None, pixels })
 }
 
 #[cfg(test)]

@@ -26,8 +26,8 @@ use terrafarm_coordinator::client::{self, Submission, Update};
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::message::ShotDone;
 use terrafarm_worker::sleeper::{GREY, Sleeper, Slept};
-use tokio::io::{AsyncBufReadExt, BufReader};
-use tokio::process::{Child, Command};
+use tokio::io::{AsyncBufReadExt, BufReader, Lines};
+use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
@@ -131,7 +131,7 @@ async fn measure(
     jobs: u64,
     store: Arc<StoreReader>,
 ) -> anyhow::Result<Run> {
-    let (mut coordinator, address) = start_coordinator().await?;
+    let Started { child: mut coordinator, address, says: _says } = start_coordinator().await?;
     let id = coordinator.id().context("the coordinator has ended")?;
     let fleet = connect(&address, workers, job).await?;
     let stop = CancellationToken::new();
@@ -188,8 +188,15 @@ impl Run {
     }
 }
 
-/// A coordinator in a process of its own, and its address. It ends with this process.
-async fn start_coordinator() -> anyhow::Result<(Child, String)> {
+/// A coordinator in a process of its own. It ends with this process.
+struct Started {
+    child: Child,
+    address: String,
+    /// What it prints; it would end if nobody listened.
+    says: Lines<BufReader<ChildStdout>>,
+}
+
+async fn start_coordinator() -> anyhow::Result<Started> {
     let program = std::env::current_exe().context("cannot find this program's own file")?;
     let mut child = Command::new(&program)
         .args(["coordinator", "--listen", "127.0.0.1:0"])
@@ -199,13 +206,13 @@ async fn start_coordinator() -> anyhow::Result<(Child, String)> {
         .spawn()
         .with_context(|| format!("cannot start a coordinator from {}", program.display()))?;
     let says = child.stdout.take().context("the coordinator has no output")?;
-    let mut lines = BufReader::new(says).lines();
-    let first = tokio::time::timeout(START_LIMIT, lines.next_line())
+    let mut says = BufReader::new(says).lines();
+    let first = tokio::time::timeout(START_LIMIT, says.next_line())
         .await
         .context("the coordinator does not start")??;
     let address = first.as_deref().and_then(|line| line.strip_prefix("coordinator on "));
     let address = address.context("the coordinator does not say its address")?.to_owned();
-    Ok((child, address))
+    Ok(Started { child, address, says })
 }
 
 /// Greeted workers, as many at a time as the system lets wait.
