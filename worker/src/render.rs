@@ -199,7 +199,16 @@ impl<C: Caster> Job<C> {
                 errors: Summary::default(),
             }
         });
-        Job { lease, view, region, check, pieces: pieces.collect(), stop, spent: Duration::ZERO, coreless: AtomicU64::new(0) }
+        Job {
+            lease,
+            view,
+            region,
+            check,
+            pieces: pieces.collect(),
+            stop,
+            spent: Duration::ZERO,
+            coreless: AtomicU64::new(0),
+        }
     }
 
     /// Renders what can be rendered, on the thread pool it is called on. Gives the reason

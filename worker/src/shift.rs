@@ -55,7 +55,7 @@ enum Report<C: Caster> {
     Spoiled(BlobHash, String),
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
-    Done(Done, Worked),
+    Done(Box<Done>, Worked),
     Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
     Broken(LeaseId, String),
@@ -304,7 +304,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 drop(scene);
                 match outcome {
                     Ok(Outcome::Done(picture)) => match packed(lease, picture, compress) {
-                        Ok((done, worked)) => Report::Done(done, worked),
+                        Ok((done, worked)) => Report::Done(Box::new(done), worked),
                         Err(why) => Report::Broken(lease, why),
                     },
                     Ok(Outcome::Missing(job, keys)) => Report::Missing(job, keys),
@@ -343,7 +343,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 let unpacking = self.unpacking_ns.swap(0, Ordering::Relaxed);
                 let unpacking = Duration::from_nanos(unpacking) / threads;
                 done.timesheet = self.clock.tear_off(worked, unpacking, Instant::now());
-                Event::Rendered(done)
+                Event::Rendered(*done)
             }
             Report::Stopped(lease) => {
                 self.clock.discard(Instant::now());

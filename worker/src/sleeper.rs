@@ -183,6 +183,7 @@ fn answer(held: &Held, spent: Duration) -> Result<Done, LinkError> {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
     use terrafarm_common::camera::Camera;
     use terrafarm_common::id::ShotId;

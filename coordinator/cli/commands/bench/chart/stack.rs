@@ -20,7 +20,7 @@ const BLUE: Color = [0, 114, 178];
 
 /// Colours of the parts: those of Okabe and Ito and shades of grey, used again after the
 /// last.
-const COLORS: [Color; 11] = [
+const COLORS: [Color; 12] = [
     [0, 138, 100],
     [150, 150, 150],
     [86, 180, 233],
@@ -31,7 +31,8 @@ const COLORS: [Color; 11] = [
     [201, 76, 0],
     [230, 159, 0],
     [150, 0, 40],
-    [70, 70, 70],
+    [110, 110, 110],
+    [40, 40, 40],
 ];
 
 /// A crew.
@@ -114,7 +115,8 @@ fn bars(drawing: &mut Drawing, names: &[&str], crews: &[Crew]) {
             if share <= 0.0 {
                 continue;
             }
-            let corners = vec![[x - half, high], [x + half, high], [x + half, low], [x - half, low]];
+            let corners =
+                vec![[x - half, high], [x + half, high], [x + half, low], [x - half, low]];
             drawing.shapes.push(Shape::Polygon { corners, fill: *fill, edge: PAPER, width: 0.6 });
             if share >= WRITTEN_SHARE {
                 let text = format!("{:.0}", 100.0 * share);
@@ -140,12 +142,7 @@ mod tests {
 
     #[test]
     fn a_bar_is_as_high_as_its_parts_and_nothing_leaves_the_paper() {
-        let crew = |parts: Vec<f64>| Crew {
-            label: "2".into(),
-            speed_up: 1.9,
-            perfect: 2.0,
-            parts,
-        };
+        let crew = |parts: Vec<f64>| Crew { label: "2".into(), speed_up: 1.9, perfect: 2.0, parts };
         let title = Title { main: "A".into(), sub: "b".into() };
         let crews = [crew(vec![0.75, 0.25]), crew(vec![1.5, -0.5])];
         let drawing = draw(&title, &["render", "tail"], &crews);

@@ -28,14 +28,15 @@ pub struct Account {
     pub tail: f64,
     /// Jobs of which nothing was used.
     pub redo: f64,
-    /// The rest: handing over between threads, the way of the first grant and of the last
-    /// result.
+    /// Handing over from thread to thread within a worker.
+    pub hand_over: f64,
+    /// The rest: the way of the first grant and of the last result.
     pub other: f64,
 }
 
 impl Account {
     /// Names of the parts, for people, in their order.
-    pub const NAMES: [&'static str; 11] = [
+    pub const NAMES: [&'static str; 12] = [
         "render",
         "no core",
         "start",
@@ -46,6 +47,7 @@ impl Account {
         "coordinator",
         "tail",
         "redo",
+        "hand-over",
         "other",
     ];
 
@@ -59,23 +61,20 @@ impl Account {
         let absent = f64::from(workers) - done.workers.len() as f64;
         sum.start += absent.max(0.0) * wall_us;
         let total_us = wall_us * f64::from(workers).max(done.workers.len() as f64);
-        let [render, coreless, start, terrain, unpack, encode, send, coordinator, tail, redo, _] =
-            sum.parts().map(|us| us / total_us);
-        let known =
-            [render, coreless, start, terrain, unpack, encode, send, coordinator, tail, redo];
-        let other = 1.0 - known.iter().sum::<f64>();
+        sum.other = total_us - sum.parts().iter().sum::<f64>();
         Account {
-            render,
-            coreless,
-            start,
-            terrain,
-            unpack,
-            encode,
-            send,
-            coordinator,
-            tail,
-            redo,
-            other,
+            render: sum.render / total_us,
+            coreless: sum.coreless / total_us,
+            start: sum.start / total_us,
+            terrain: sum.terrain / total_us,
+            unpack: sum.unpack / total_us,
+            encode: sum.encode / total_us,
+            send: sum.send / total_us,
+            coordinator: sum.coordinator / total_us,
+            tail: sum.tail / total_us,
+            redo: sum.redo / total_us,
+            hand_over: sum.hand_over / total_us,
+            other: sum.other / total_us,
         }
     }
 
@@ -92,10 +91,11 @@ impl Account {
         self.coordinator += sheet.idle_us as f64;
         self.tail += wall_us - share.last_us as f64;
         self.redo += sheet.redo_us as f64;
+        self.hand_over += sheet.other_us as f64;
     }
 
     /// The parts in the order of [`Self::NAMES`].
-    pub fn parts(&self) -> [f64; 11] {
+    pub fn parts(&self) -> [f64; 12] {
         [
             self.render,
             self.coreless,
@@ -107,6 +107,7 @@ impl Account {
             self.coordinator,
             self.tail,
             self.redo,
+            self.hand_over,
             self.other,
         ]
     }

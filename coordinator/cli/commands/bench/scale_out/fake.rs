@@ -163,9 +163,8 @@ impl Run {
         own_cpu_s: Option<f64>,
     ) -> Self {
         let seconds = (done.elapsed_us as f64 * 1e-6).max(1e-6);
-        let total = |of: fn(&Slept) -> Duration| {
-            slept.iter().map(|one| of(one).as_secs_f64()).sum::<f64>()
-        };
+        let total =
+            |of: fn(&Slept) -> Duration| slept.iter().map(|one| of(one).as_secs_f64()).sum::<f64>();
         let busy = total(|one| one.busy) / total(|one| one.span).max(1e-9);
         let mut waits_ms: Vec<f64> =
             slept.iter().flat_map(|one| &one.waits).map(|wait| wait.as_secs_f64() * 1e3).collect();

@@ -4,7 +4,7 @@
 //! workers as child processes of one thread each. One process of two threads is measured
 //! beside them. All crews take turns, so that whatever else the PC does meets all of them;
 //! of each, the run in the middle counts. A run begins when every worker has done a job of
-//! a tiny shot; its terrain is fetched anew. Frames stay in memory, and their SHA-256, taken
+//! a tiny shot over other terrain; its own is fetched anew. Frames stay in memory, and their SHA-256, taken
 //! when the clock has stopped, must be the same for all crews.
 
 use super::super::chart::{self, stack};
@@ -55,6 +55,8 @@ const WAY: [f64; 2] = [0.15, 0.55];
 const ABOVE_M: f64 = 400.0;
 const CLEARED_M: f64 = 200.0;
 const TOLERANCE_PX: f64 = 0.5;
+/// Height of the camera over the yard, metres: above its noise.
+const YARD_HEIGHT_M: f64 = 5_000.0;
 /// The short form.
 const SHORT_SIZE: (u32, u32) = (160, 90);
 const SHORT_FRAMES: u32 = 8;
@@ -125,14 +127,15 @@ pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
         );
     }
     let land = land(args)?;
+    let yard = Land::noise(65)?;
     let cameras = flight(&land, size, frames)?;
-    let store = Arc::new(land.store);
+    let (store, yard) = (Arc::new(land.store), Arc::new(yard.store));
     let repeats = if args.short { 1 } else { args.repeats };
     let runtime = runtime()?;
     let mut passes: Vec<Vec<Pass>> = crews.iter().map(|_| Vec::new()).collect();
     for _ in 0..repeats {
         for (crew, passes) in crews.iter().zip(&mut passes) {
-            let pass = runtime.block_on(fly(*crew, &store, &cameras))?;
+            let pass = runtime.block_on(fly(*crew, &yard, &store, &cameras))?;
             eprintln!(
                 "terrafarm: {} x {} threads: {} frames/s",
                 crew.workers,
@@ -206,21 +209,13 @@ fn submission(store: &Arc<StoreReader>, cameras: Vec<Camera>, split: Split) -> S
         store: store.clone(),
         shading: Shading {
             sun: Some(Sun::at(315.0, 35.0, 0.35, 0.65)),
-            haze: Some(Haze {
-                visibility_m: 4e4,
-                scale_height_m: 0.0,
-                color: [0.72, 0.78, 0.86],
-            }),
+            haze: Some(Haze { visibility_m: 4e4, scale_height_m: 0.0, color: [0.72, 0.78, 0.86] }),
             sky: Sky::default(),
             earth: None,
             below_ground: [0.0; 3],
             bare_ground: None,
         },
-        quality: Quality {
-            method: Method::Auto,
-            samples_per_side: 1,
-            tolerance_px: TOLERANCE_PX,
-        },
+        quality: Quality { method: Method::Auto, samples_per_side: 1, tolerance_px: TOLERANCE_PX },
         check: Share::NONE,
         split,
         cameras,
@@ -228,15 +223,21 @@ fn submission(store: &Arc<StoreReader>, cameras: Vec<Camera>, split: Split) -> S
     }
 }
 
-/// One crew, from its start to its end; the flight alone is timed.
-async fn fly(crew: Crew, store: &Arc<StoreReader>, cameras: &[Camera]) -> anyhow::Result<Pass> {
+/// One crew, from its start over the yard, where it gathers, to its end; the flight alone is
+/// timed.
+async fn fly(
+    crew: Crew,
+    yard: &Arc<StoreReader>,
+    store: &Arc<StoreReader>,
+    cameras: &[Camera],
+) -> anyhow::Result<Pass> {
     let farm = LocalFarm::start(crew).await?;
     let address = farm.address.to_string();
     let began = Instant::now();
     loop {
-        let first = cameras.first().copied().context("the flight has no frame")?;
-        let tiny = Camera { width: 64, height: 64, ..first };
-        let shot = submission(store, vec![tiny; 2], Split::Tiles(8));
+        let eye = DVec3::new(0.0, 0.0, YARD_HEIGHT_M);
+        let tiny = Camera::from_angles(eye, 45.0, -30.0, 0.0, 60.0, (64, 64));
+        let shot = submission(yard, vec![tiny; 2], Split::Tiles(8));
         let (done, _) = render(&address, shot).await?;
         if done.workers.len() as u32 >= crew.workers {
             break;
@@ -249,8 +250,7 @@ async fn fly(crew: Crew, store: &Arc<StoreReader>, cameras: &[Camera]) -> anyhow
     let cpu_s = cpu.zip(process::own_cpu_s()).map(|(before, after)| after - before);
     farm.stop().await;
     ensure!(frames.len() == cameras.len(), "{} frames failed", cameras.len() - frames.len());
-    let hashes: Vec<u8> =
-        frames.values().flat_map(|frame| sink::pixels_sha256(frame).0).collect();
+    let hashes: Vec<u8> = frames.values().flat_map(|frame| sink::pixels_sha256(frame).0).collect();
     let seconds = (done.elapsed_us as f64 * 1e-6).max(1e-6);
     Ok(Pass { done, seconds, cpu_s, sha256: hash_of(&hashes).to_hex() })
 }
