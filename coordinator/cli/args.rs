@@ -369,6 +369,8 @@ pub enum Bench {
     SpeedAccuracy(BenchSpeedAccuracy),
     /// Cost of a frame, and of its terrain in memory, over ever larger terrain on disk
     TerrainSize(BenchTerrainSize),
+    /// What more worker processes bring on this PC, and where their time goes
+    ScaleOut(BenchScaleOut),
     /// Situations in which methods are known to fail, by every method that may be asked
     Stability(BenchStability),
 }
@@ -451,6 +453,53 @@ pub struct BenchTerrainSize {
     /// Timed runs of each frame, of which the median counts
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub repeats: u32,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// `terrafarm bench scale-out`
+#[derive(Debug, ClapArgs)]
+pub struct BenchScaleOut {
+    /// Numbers of workers, with commas [default: 1,2,4,8; with --fake 1,10,100,1000]
+    #[arg(long, value_delimiter = ',', value_name = "N",
+        value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub workers: Vec<u32>,
+    /// Workers that sleep instead of rendering: how much the coordinator can do
+    #[arg(long)]
+    pub fake: bool,
+    /// How long a sleeping worker takes for a job, milliseconds
+    #[arg(long, value_name = "MS", default_value_t = 0, requires = "fake",
+        value_parser = clap::value_parser!(u64).range(0..=60_000))]
+    pub job_ms: u64,
+    /// Jobs for the sleeping workers, each of 8 x 8 pixels
+    #[arg(long, default_value_t = 200_000, requires = "fake",
+        value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    pub jobs: u64,
+    /// Size of the picture
+    #[arg(long, value_parser = parse_size, value_name = "WxH", default_value = "1280x720",
+        conflicts_with = "fake")]
+    pub size: (u32, u32),
+    /// Frames of the flight
+    #[arg(long, default_value_t = 120, conflicts_with = "fake",
+        value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: u32,
+    /// Runs of each number of workers, of which the one in the middle counts
+    #[arg(long, default_value_t = 3, conflicts_with = "fake",
+        value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// Folder that keeps the terrain, and where it is looked for [default: a temporary one]
+    #[arg(long, value_name = "FOLDER", conflicts_with = "fake")]
+    pub stores: Option<PathBuf>,
+    /// Few frames or jobs, for a quick look
+    #[arg(long)]
+    pub short: bool,
+    /// Write the chart as SVG
+    #[arg(long, value_name = "FILE", conflicts_with = "fake")]
+    pub svg: Option<PathBuf>,
+    /// Write the chart as PNG
+    #[arg(long, value_name = "FILE", conflicts_with = "fake")]
+    pub png: Option<PathBuf>,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

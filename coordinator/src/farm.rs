@@ -14,7 +14,7 @@ use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::limits::clip_reason;
 use terrafarm_wire::message::{
     Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
-    Progress, Rejected, Revoke, ShotFailed, WantBlobs,
+    Progress, Rejected, Revoke, ShotFailed, Timesheet, WantBlobs,
 };
 
 /// Shortest time between two progress messages of a shot, microseconds.
@@ -325,6 +325,7 @@ impl Farm {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
                 let name =
                     self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
+                self.shots.count_time(shot, name, &done.timesheet, now);
                 let (report, check) = (&done.report, done.check.as_ref());
                 self.shots.count_job(shot, frame, name, report, check);
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
@@ -333,12 +334,31 @@ impl Farm {
             }
             (Some(Action::Refuse { why, .. }), _) => {
                 tracing::info!(%worker, %lease, ?why, "late result refused");
+                let shot = granted.map(|granted| granted.shot);
+                self.count_waste(now, worker, shot, &done.timesheet);
             }
             (other, _) => tracing::error!(%lease, ?other, "no verdict on a result"),
         }
         self.end_lease(worker, lease);
         self.obey(now);
         self.report_progress(now, granted.map(|granted| granted.shot));
+    }
+
+    /// Counts the time of a refused result. Where its lease is forgotten, it belongs to the
+    /// only shot that the worker was told of, if there is only one.
+    fn count_waste(
+        &mut self,
+        now: Micros,
+        worker: WorkerId,
+        shot: Option<ShotId>,
+        sheet: &Timesheet,
+    ) {
+        let Some(state) = self.workers.get(&worker) else { return };
+        let mut opened = state.opened.iter().copied();
+        let only = opened.next().filter(|_| opened.next().is_none());
+        if let Some(shot) = shot.or(only) {
+            self.shots.count_time(shot, &state.greeting.name, &sheet.wasted(), now);
+        }
     }
 
     fn schedule(&mut self, now: Micros, event: Event) {
@@ -427,6 +447,9 @@ impl Farm {
         worker_state.leases.insert(lease);
         self.granted.insert(lease, granted);
         if let Some(open) = open {
+            if let Some(state) = self.workers.get(&worker) {
+                self.shots.begin_share(shot, &state.greeting.name, now);
+            }
             self.send(Peer::Worker(worker), open);
         }
         self.send(Peer::Worker(worker), Grant { lease, shot, frame, region, camera });

@@ -11,7 +11,7 @@ use terrafarm_film::{Film, FilmError, Merge};
 use terrafarm_sched::{Event, Micros};
 use terrafarm_wire::limits::WORKER_SHARES_MAX;
 use terrafarm_wire::message::{
-    Accepted, Cameras, Frame, RenderReport, ShotDone, Submit, WorkerShare,
+    Accepted, Cameras, Frame, RenderReport, ShotDone, Submit, Timesheet, WorkerShare,
 };
 
 /// Most frames of all shots together: their cameras take about 0.5 GB.
@@ -246,9 +246,32 @@ impl Shots {
         if let Some(share) = state.shares.get_mut(worker) {
             share.jobs += 1;
             share.cost_us = share.cost_us.saturating_add(report.cost_us);
-        } else if state.shares.len() < WORKER_SHARES_MAX {
-            let share = WorkerShare { name: worker.to_owned(), jobs: 1, cost_us: report.cost_us };
+        }
+    }
+
+    /// A worker is granted its first job of a shot.
+    pub fn begin_share(&mut self, shot: ShotId, worker: &str, now: Micros) {
+        let Some(state) = self.shots.get_mut(&shot) else { return };
+        if state.shares.len() < WORKER_SHARES_MAX && !state.shares.contains_key(worker) {
+            let first_us = now.since(state.since);
+            let share = WorkerShare {
+                name: worker.to_owned(),
+                jobs: 0,
+                cost_us: 0,
+                first_us,
+                last_us: first_us,
+                timesheet: Timesheet::default(),
+            };
             state.shares.insert(worker.to_owned(), share);
+        }
+    }
+
+    /// Counts the time of a worker, whose result may have been refused.
+    pub fn count_time(&mut self, shot: ShotId, worker: &str, sheet: &Timesheet, now: Micros) {
+        let Some(state) = self.shots.get_mut(&shot) else { return };
+        if let Some(share) = state.shares.get_mut(worker) {
+            share.last_us = now.since(state.since);
+            share.timesheet.add(sheet);
         }
     }
 
@@ -314,7 +337,7 @@ impl Shots {
             jobs_repeated: state.jobs_granted.saturating_sub(state.jobs),
             elapsed_us: now.since(state.since),
             report: state.report,
-            workers: state.shares.values().cloned().collect(),
+            workers: state.shares.values().filter(|share| share.jobs > 0).cloned().collect(),
         };
         Some((state.client, done))
     }

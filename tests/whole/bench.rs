@@ -138,3 +138,51 @@ fn no_method_is_silently_wrong_in_any_scene_of_the_stability_suite() {
     assert!(cells.iter().any(|cell| cell["outcome"] == "fallback"));
     assert_eq!(ended.status.code(), Some(0));
 }
+
+#[test]
+fn more_workers_give_the_same_bytes_and_an_account_of_all_their_time() {
+    let dir = Dir::new();
+    let [report, svg] = ["scale.json", "scale.svg"].map(|name| dir.path(name));
+    let mut command = terrafarm();
+    command.args(["bench", "scale-out", "--short", "--json"]).arg(&report);
+    let text = succeed(command.arg("--svg").arg(&svg));
+    assert!(text.contains("the same bytes from all"), "{text}");
+    let report = json(&report);
+    assert_eq!(report["sha256"].as_str().unwrap().len(), 64);
+    let runs = report["runs"].as_array().unwrap();
+    let crews: Vec<_> =
+        runs.iter().map(|run| (run["workers"].as_u64(), run["threads"].as_u64())).collect();
+    assert_eq!(crews, [(1, 1), (2, 1), (1, 2)].map(|(w, t)| (Some(w), Some(t))));
+    for run in runs {
+        let account = run["account"].as_object().unwrap();
+        let total: f64 = account.values().map(|part| part.as_f64().unwrap()).sum();
+        assert!((total - 1.0).abs() < 1e-6, "{run}");
+        for part in ["render", "terrain", "unpack"] {
+            assert!(account[part].as_f64().unwrap() > 0.0, "{part} in {run}");
+        }
+        // What is not named is little: clocks of worker and coordinator agree.
+        assert!(account["other"].as_f64().unwrap().abs() < 0.25, "{run}");
+    }
+    assert!(std::fs::read_to_string(&svg).unwrap().contains("render"));
+}
+
+#[test]
+fn sleeping_workers_answer_every_job_and_say_how_long_they_waited() {
+    let dir = Dir::new();
+    let report = dir.path("fake.json");
+    let mut command = terrafarm();
+    command.args(["bench", "scale-out", "--fake", "--short", "--job-ms", "1"]);
+    succeed(command.args(["--workers", "3,40", "--json"]).arg(&report));
+    let report = json(&report);
+    let runs = report["runs"].as_array().unwrap();
+    assert_eq!(runs.len(), 2);
+    for run in runs {
+        assert!(run["jobs"].as_u64().unwrap() >= 2000, "{run}");
+        assert!(run["jobs_per_s"].as_f64().unwrap() > 0.0, "{run}");
+        let busy = run["busy"].as_f64().unwrap();
+        assert!(0.0 < busy && busy <= 1.0, "{run}");
+        assert!(!cfg!(target_os = "linux") || run["coordinator_cores"].is_f64(), "{run}");
+    }
+    run(terrafarm().args(["bench", "scale-out", "--workers", "65"]), 2);
+    run(terrafarm().args(["bench", "scale-out", "--job-ms", "5"]), 2);
+}

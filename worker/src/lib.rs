@@ -3,7 +3,9 @@
 //! [`run`] is the whole of it. Read in this order: [`session`] decides what to do about
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
-//! the session asks for over one connection; `backoff` says when to try again.
+//! the session asks for over one connection; `backoff` says when to try again, `clock` where the
+//! time goes. A [`sleeper`]
+//! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
 //! grants its leases to others. It needs no file but the tile cache, and works without.
@@ -11,9 +13,11 @@
 //! answer heartbeats.
 
 mod backoff;
+mod clock;
 pub mod render;
 pub mod session;
 mod shift;
+pub mod sleeper;
 pub mod terrain;
 
 pub use backoff::Reconnect;

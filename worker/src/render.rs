@@ -5,12 +5,13 @@
 //! that; tiles that only the measurement needs are waited for like others. The stop flag is looked at before each piece: a revoked job ends within the
 //! time of one piece a core. A panic of the ray caster ends the job, not the worker.
 
+use crate::clock::CoreClock;
 use rayon::prelude::*;
 use std::any::Any;
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::{PixelError, Share, Summary, pixel_number};
 use terrafarm_common::id::{FrameIndex, LeaseId};
@@ -140,6 +141,8 @@ pub struct Job<C: Caster> {
     pieces: Vec<Piece<C>>,
     stop: Arc<AtomicBool>,
     spent: Duration,
+    /// How much of it others had the cores, all threads together.
+    coreless: AtomicU64,
 }
 
 struct Piece<C: Caster> {
@@ -172,6 +175,8 @@ pub struct Picture {
     pub errors: Option<Summary>,
     /// Time on the pool, waiting for tiles left out.
     pub spent: Duration,
+    /// Time that threads of the pool were at work without a core, all of them together.
+    pub coreless: Duration,
 }
 
 impl<C: Caster> Job<C> {
@@ -194,7 +199,16 @@ impl<C: Caster> Job<C> {
                 errors: Summary::default(),
             }
         });
-        Job { lease, view, region, check, pieces: pieces.collect(), stop, spent: Duration::ZERO }
+        Job {
+            lease,
+            view,
+            region,
+            check,
+            pieces: pieces.collect(),
+            stop,
+            spent: Duration::ZERO,
+            coreless: AtomicU64::new(0),
+        }
     }
 
     /// Renders what can be rendered, on the thread pool it is called on. Gives the reason
@@ -226,11 +240,13 @@ impl<C: Caster> Job<C> {
         scene: &Scene<C::Prepared>,
     ) -> Result<BTreeSet<TileKey>, Unfit> {
         let (view, stop, frame) = (&self.view, &self.stop, self.check.frame);
+        let coreless = &self.coreless;
         let open = self.pieces.par_iter_mut().with_max_len(1).filter(|piece| !piece.is_done());
         let advanced = open.map(|piece| {
             if stop.load(Ordering::Relaxed) {
                 return Ok(BTreeSet::new());
             }
+            let _counted = CoreClock::start(coreless);
             if !piece.rendered {
                 let missing = caster.advance(scene, view, &mut piece.progress)?;
                 piece.rendered = missing.is_empty();
@@ -267,8 +283,9 @@ impl<C: Caster> Job<C> {
             errors.merge(&piece.errors);
         }
         let spent = self.spent + began.elapsed();
+        let coreless = Duration::from_nanos(self.coreless.into_inner());
         let errors = (self.check.share != Share::NONE).then_some(errors);
-        Ok(Picture { pixels: picture.into_pixels(), stats, errors, spent })
+        Ok(Picture { pixels: picture.into_pixels(), stats, errors, spent, coreless })
     }
 }
 

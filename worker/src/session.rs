@@ -118,6 +118,20 @@ enum Phase {
     Stopping,
 }
 
+/// What a worker does, as far as its session knows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Doing {
+    /// It has no job.
+    #[default]
+    Idle,
+    /// Its job waits for terrain.
+    Waiting,
+    /// Its job renders.
+    Rendering,
+    /// It has jobs, and pixels that the link has to take first.
+    Sending,
+}
+
 /// How a blob that is not in memory comes there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Supply {
@@ -171,6 +185,16 @@ impl Session {
         self.begin();
         self.ask();
         self.finish();
+    }
+
+    /// What is done until the next event.
+    pub fn doing(&self) -> Doing {
+        match &self.current {
+            Some(Current { phase: Phase::Waiting(_), .. }) => Doing::Waiting,
+            Some(_) => Doing::Rendering,
+            None if self.unsent > 0 && !self.queue.is_empty() => Doing::Sending,
+            None => Doing::Idle,
+        }
     }
 
     /// The next thing to do; `None` until the next event.

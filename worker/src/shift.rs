@@ -5,16 +5,17 @@
 //! the thread pool, writing in a task of its own), so that a heartbeat is answered at
 //! once whatever else goes on.
 
+use crate::clock::{TaskClock, Worked};
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
-use crate::session::{Action, Event, Session};
+use crate::session::{Action, Doing, Event, Session};
 use crate::terrain::Terrain;
 use bytes::Bytes;
 use rayon::ThreadPool;
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 use terrafarm_common::id::{BlobHash, LeaseId};
 use terrafarm_raycast::View;
 use terrafarm_terrain::cache::BlobCache;
@@ -24,7 +25,9 @@ use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
-use terrafarm_wire::message::{Blob, Done, Grant, OpenShot, Pong, RenderReport, Welcome};
+use terrafarm_wire::message::{
+    Blob, Done, Grant, OpenShot, Pong, RenderReport, Timesheet, Welcome,
+};
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::mpsc;
@@ -52,7 +55,7 @@ enum Report<C: Caster> {
     Spoiled(BlobHash, String),
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
-    Done(Done),
+    Done(Box<Done>, Worked),
     Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
     Broken(LeaseId, String),
@@ -67,6 +70,9 @@ pub(crate) struct Shift<'a, C: Caster> {
     /// The store of the job that is begun, and how to stop it.
     current: Option<(BlobHash, Arc<AtomicBool>)>,
     paused: Option<Box<Job<C>>>,
+    clock: TaskClock,
+    /// Time of the pool for reading and unpacking terrain, nanoseconds of all threads.
+    unpacking_ns: Arc<AtomicU64>,
     /// What the outbox had no room for, in order.
     backlog: VecDeque<Message>,
     ended: bool,
@@ -85,6 +91,8 @@ impl<'a, C: Caster> Shift<'a, C> {
             silence: Duration::from_micros(welcome.silence_us),
             current: None,
             paused: None,
+            clock: TaskClock::new(Instant::now()),
+            unpacking_ns: Arc::default(),
             backlog: VecDeque::new(),
             ended: false,
             reports,
@@ -144,7 +152,7 @@ impl<'a, C: Caster> Shift<'a, C> {
     }
 
     /// A message as an event; heartbeats are answered here.
-    fn received(&self, message: Message, outbox: &Outbox) -> Result<Option<Event>, LinkError> {
+    fn received(&mut self, message: Message, outbox: &Outbox) -> Result<Option<Event>, LinkError> {
         match message {
             Message::Ping(ping) => {
                 // A full lane means that the coordinator will hear from us in any case.
@@ -154,6 +162,14 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Ok(None)
             }
             Message::Goodbye(_) => Err(LinkError::Closed),
+            Message::OpenShot(open) => {
+                // What this worker did before is no part of the shot.
+                if self.session.doing() == Doing::Idle {
+                    self.clock = TaskClock::new(Instant::now());
+                    self.unpacking_ns.store(0, Ordering::Relaxed);
+                }
+                Ok(Some(Event::Received(open.into())))
+            }
             message => Ok(Some(Event::Received(message))),
         }
     }
@@ -173,6 +189,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 }
                 Action::Discard(_) => {
                     self.paused = None;
+                    self.clock.discard(Instant::now());
                     None
                 }
                 Action::Release(store) => {
@@ -188,6 +205,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 self.session.handle(event);
             }
         }
+        self.clock.turn(self.session.doing(), Instant::now());
     }
 
     /// Sends now if there is room, later otherwise.
@@ -207,11 +225,13 @@ impl<'a, C: Caster> Shift<'a, C> {
         let Some(cache) = self.site.cache.clone() else {
             return Some(Event::Absent(hash));
         };
-        let caster = self.site.caster.clone();
+        let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         self.spawn(
-            move || match cache.get(&hash) {
-                Some(bytes) => decoded(&*caster, hash, &bytes),
-                None => Report::Absent(hash),
+            move || {
+                counted(&unpacking_ns, || match cache.get(&hash) {
+                    Some(bytes) => decoded(&*caster, hash, &bytes),
+                    None => Report::Absent(hash),
+                })
             },
             move |panic| Report::Spoiled(hash, panic),
         );
@@ -220,7 +240,7 @@ impl<'a, C: Caster> Shift<'a, C> {
 
     fn take(&mut self, blob: Blob) -> Option<Event> {
         let Blob { hash, bytes } = blob;
-        let caster = self.site.caster.clone();
+        let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         let cache = self.site.cache.clone();
         let keep = move |bytes: &Bytes| {
             if let Some(Err(error)) = cache.map(|cache| cache.put(&hash, bytes)) {
@@ -229,14 +249,16 @@ impl<'a, C: Caster> Shift<'a, C> {
         };
         self.spawn(
             move || {
-                if hash_of(&bytes) != hash {
-                    return Report::Spoiled(hash, "what came has another hash".to_owned());
-                }
-                let report = decoded(&*caster, hash, &bytes);
-                if !matches!(report, Report::Spoiled(..)) {
-                    keep(&bytes);
-                }
-                report
+                counted(&unpacking_ns, || {
+                    if hash_of(&bytes) != hash {
+                        return Report::Spoiled(hash, "what came has another hash".to_owned());
+                    }
+                    let report = decoded(&*caster, hash, &bytes);
+                    if !matches!(report, Report::Spoiled(..)) {
+                        keep(&bytes);
+                    }
+                    report
+                })
             },
             move |panic| Report::Spoiled(hash, panic),
         );
@@ -282,7 +304,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 drop(scene);
                 match outcome {
                     Ok(Outcome::Done(picture)) => match packed(lease, picture, compress) {
-                        Ok(done) => Report::Done(done),
+                        Ok((done, worked)) => Report::Done(Box::new(done), worked),
                         Err(why) => Report::Broken(lease, why),
                     },
                     Ok(Outcome::Missing(job, keys)) => Report::Missing(job, keys),
@@ -315,9 +337,22 @@ impl<'a, C: Caster> Shift<'a, C> {
                     Some(why) => Event::Spoiled(hash, why),
                 }
             }
-            Report::Done(done) => Event::Rendered(done),
-            Report::Stopped(lease) => Event::Stopped(lease),
-            Report::Broken(lease, why) => Event::Broken(lease, why),
+            Report::Done(mut done, mut worked) => {
+                let threads = self.site.pool.current_num_threads().max(1) as u32;
+                worked.coreless /= threads;
+                let unpacking = self.unpacking_ns.swap(0, Ordering::Relaxed);
+                let unpacking = Duration::from_nanos(unpacking) / threads;
+                done.timesheet = self.clock.tear_off(worked, unpacking, Instant::now());
+                Event::Rendered(*done)
+            }
+            Report::Stopped(lease) => {
+                self.clock.discard(Instant::now());
+                Event::Stopped(lease)
+            }
+            Report::Broken(lease, why) => {
+                self.clock.discard(Instant::now());
+                Event::Broken(lease, why)
+            }
             Report::Missing(job, keys) => {
                 let lease = job.lease;
                 let store = self.current.as_ref().map(|(store, _)| *store);
@@ -363,6 +398,14 @@ async fn send_waiting(outbox: &Outbox, message: Option<Message>) -> Result<(), L
     }
 }
 
+/// Does something and adds the time that it takes to a count of nanoseconds.
+fn counted<T>(into_ns: &AtomicU64, call: impl FnOnce() -> T) -> T {
+    let began = Instant::now();
+    let result = call();
+    into_ns.fetch_add(began.elapsed().as_nanos() as u64, Ordering::Relaxed);
+    result
+}
+
 /// A blob says itself whether it is a tile; what is none should be an index.
 fn decoded<C: Caster>(caster: &C, hash: BlobHash, bytes: &[u8]) -> Report<C> {
     match codec::decode(bytes) {
@@ -379,7 +422,8 @@ fn decoded<C: Caster>(caster: &C, hash: BlobHash, bytes: &[u8]) -> Report<C> {
     }
 }
 
-fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<Done, String> {
+fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<(Done, Worked), String> {
+    let began = Instant::now();
     let pack = if compress { Pixels::compressed } else { Pixels::raw };
     let pixels = pack(picture.pixels.into()).map_err(|unfit| unfit.to_string())?;
     let report = RenderReport {
@@ -389,5 +433,9 @@ fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<Done, Stri
         fallbacks: picture.stats.fallbacks,
         below_ground: picture.stats.below_ground,
     };
-    Ok(Done { lease, report, check: picture.errors, pixels })
+    let worked =
+        Worked { render: picture.spent, coreless: picture.coreless, pack: began.elapsed() };
+    // The sheet is filled in by the shift, which keeps the clock.
+    let timesheet = Timesheet::default();
+    Ok((Done { lease, report, timesheet, check: picture.errors, pixels }, worked))
 }

@@ -19,7 +19,9 @@ pub use shot::{
     Accepted, Cameras, Cancel, Frame, FrameFailed, FrameTaken, Progress, Rejected, ShotDone,
     ShotFailed, Submit, WorkerShare,
 };
-pub use work::{CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke};
+pub use work::{
+    CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Timesheet,
+};
 
 use crate::limits::{Class, NAME_BYTES_MAX, REASON_BYTES_MAX};
 use bytes::Bytes;

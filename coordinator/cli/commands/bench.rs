@@ -5,6 +5,7 @@
 //! | `bench core` | how fast is each method on one core? | `core` |
 //! | `bench speed-accuracy` | what does a smaller error cost? | `speed_accuracy`, `chart` |
 //! | `bench terrain-size` | what does a frame cost over ever larger terrain? | `terrain_size` |
+//! | `bench scale-out` | what do more workers bring, and where does the time go? | `scale_out` |
 //! | `bench stability` | is any method silently wrong where it is known to be hard? | `stability` |
 //!
 //! Nothing is timed or charted without being checked, and a method that breaks its
@@ -17,6 +18,7 @@ mod core;
 mod kernel;
 mod land;
 mod report;
+mod scale_out;
 mod speed_accuracy;
 mod stability;
 mod terrain_size;
@@ -30,6 +32,7 @@ pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
         args::Bench::Core(args) => core::run(args),
         args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
         args::Bench::TerrainSize(args) => terrain_size::run(args),
+        args::Bench::ScaleOut(args) => scale_out::run(args),
         args::Bench::Stability(args) => stability::run(args),
     }
 }

@@ -10,7 +10,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_wire::message::{CloseShot, Drain, RenderReport, Revoke};
+use terrafarm_wire::message::{CloseShot, Drain, RenderReport, Revoke, Timesheet};
 use terrafarm_wire::pixels::Pixels;
 
 const INDEX: BlobHash = BlobHash([1; 32]);
@@ -52,7 +52,8 @@ fn blob(hash: BlobHash) -> Blob {
 
 fn done(lease: u64) -> Done {
     let pixels = Pixels::raw(vec![0; 96].into()).unwrap();
-    Done { lease: LeaseId(lease), report: RenderReport::default(), check: None, pixels }
+    let (report, timesheet) = (RenderReport::default(), Timesheet::default());
+    Done { lease: LeaseId(lease), report, timesheet, check: None, pixels }
 }
 
 /// What the session wants after these events, in short.

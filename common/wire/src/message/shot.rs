@@ -4,6 +4,7 @@
 //! then hears [`Accepted`] or [`Rejected`]. It supplies the shot's terrain when asked
 //! and answers every [`Frame`] by a [`FrameTaken`], which lets the next one be sent.
 
+use super::work::Timesheet;
 use super::{Body, Unfit, fit_name, fit_reason, own_twin};
 use crate::limits::{CAMERAS_MAX, FRAMES_IN_FLIGHT_MAX, FRAMES_MAX, WORKER_SHARES_MAX};
 use crate::message::work::RenderReport;
@@ -324,6 +325,13 @@ pub struct WorkerShare {
     pub jobs: u64,
     /// Time it rendered for them, microseconds.
     pub cost_us: u64,
+    /// When it was granted its first job, microseconds after the submission.
+    pub first_us: u64,
+    /// When its last result had come, microseconds after the submission.
+    pub last_us: u64,
+    /// Where its time went between the two, the ways of the first grant and of the last
+    /// result left out.
+    pub timesheet: Timesheet,
 }
 
 /// Every frame is made or has failed.

@@ -181,6 +181,70 @@ pub struct RenderReport {
     pub below_ground: bool,
 }
 
+/// Where a worker's wall time went since its last result, or since it was told of the shot
+/// if that came later, microseconds. The parts do not overlap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Timesheet {
+    /// No job was in hand.
+    pub idle_us: u64,
+    /// A job waited for terrain to come.
+    pub terrain_us: u64,
+    /// A job waited for terrain to be read from disk, checked and unpacked.
+    pub unpack_us: u64,
+    /// Rendering on a core.
+    pub render_us: u64,
+    /// Rendering, but another program or worker had the core; 0 where the system does not
+    /// tell, which then is part of `render_us`.
+    pub coreless_us: u64,
+    /// Packing pixels for the link.
+    pub pack_us: u64,
+    /// Pixels waited for the link to take them, and no job could begin.
+    pub send_us: u64,
+    /// Spent on jobs of which nothing was used: revoked, failed, or done twice.
+    pub redo_us: u64,
+    /// Between the others: handing over from thread to thread.
+    pub other_us: u64,
+}
+
+impl Timesheet {
+    /// All of it, microseconds.
+    pub fn total_us(&self) -> u64 {
+        let parts = [
+            self.idle_us,
+            self.terrain_us,
+            self.unpack_us,
+            self.render_us,
+            self.coreless_us,
+            self.pack_us,
+            self.send_us,
+            self.redo_us,
+            self.other_us,
+        ];
+        parts.into_iter().fold(0, u64::saturating_add)
+    }
+
+    /// Adds another one.
+    pub fn add(&mut self, more: &Timesheet) {
+        let sum = |own: &mut u64, more: u64| *own = own.saturating_add(more);
+        sum(&mut self.idle_us, more.idle_us);
+        sum(&mut self.terrain_us, more.terrain_us);
+        sum(&mut self.unpack_us, more.unpack_us);
+        sum(&mut self.render_us, more.render_us);
+        sum(&mut self.coreless_us, more.coreless_us);
+        sum(&mut self.pack_us, more.pack_us);
+        sum(&mut self.send_us, more.send_us);
+        sum(&mut self.redo_us, more.redo_us);
+        sum(&mut self.other_us, more.other_us);
+    }
+
+    /// The same time for a result that was refused: rendering and packing were for nothing.
+    pub fn wasted(self) -> Timesheet {
+        let lost = [self.render_us, self.coreless_us, self.pack_us];
+        let redo_us = lost.into_iter().fold(self.redo_us, u64::saturating_add);
+        Timesheet { render_us: 0, coreless_us: 0, pack_us: 0, redo_us, ..self }
+    }
+}
+
 /// The pixels of a job. They travel behind the message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Done {
@@ -188,6 +252,8 @@ pub struct Done {
     pub lease: LeaseId,
     /// What it took.
     pub report: RenderReport,
+    /// Where the worker's time went.
+    pub timesheet: Timesheet,
     /// The errors of the pixels that were measured; `None` if none were to be.
     pub check: Option<Summary>,
     /// The pixels of the region.
@@ -199,6 +265,7 @@ pub struct Done {
 pub(crate) struct DoneTwin {
     lease: LeaseId,
     report: RenderReport,
+    timesheet: Timesheet,
     check: Option<SummaryTwin>,
     pixels: Pixels,
 }
@@ -210,14 +277,16 @@ impl Body for Done {
         DoneTwin {
             lease: self.lease,
             report: self.report,
+            timesheet: self.timesheet,
             check: self.check.as_ref().map(SummaryTwin::from),
             pixels: self.pixels.clone(),
         }
     }
 
     fn from_wire(wire: DoneTwin) -> Result<Self, Unfit> {
-        let check = wire.check.map(Summary::try_from).transpose()?;
-        Ok(Done { lease: wire.lease, report: wire.report, check, pixels: wire.pixels })
+        let DoneTwin { lease, report, timesheet, check, pixels } = wire;
+        let check = check.map(Summary::try_from).transpose()?;
+        Ok(Done { lease, report, timesheet, check, pixels })
     }
 
     fn check(&self) -> Result<(), Unfit> {

@@ -46,6 +46,20 @@ fn report() -> RenderReport {
     }
 }
 
+fn timesheet() -> Timesheet {
+    Timesheet {
+        idle_us: 300,
+        terrain_us: 40_000,
+        unpack_us: 5_000,
+        render_us: 12_000,
+        coreless_us: 345,
+        pack_us: 60,
+        send_us: 7,
+        redo_us: 0,
+        other_us: 1,
+    }
+}
+
 /// Errors of three pixels, two of which see other ground.
 fn errors() -> Summary {
     let mut errors = Summary::default();
@@ -114,7 +128,14 @@ pub fn all() -> Vec<(String, Message)> {
         Revoke { lease }.into(),
         CloseShot { shot }.into(),
         Drain {}.into(),
-        Done { lease, report: report(), check: Some(errors()), pixels: pixels() }.into(),
+        Done {
+            lease,
+            report: report(),
+            timesheet: timesheet(),
+            check: Some(errors()),
+            pixels: pixels(),
+        }
+        .into(),
         Failed { lease, reason: text() }.into(),
         HandBack { leases: vec![lease, LeaseId(0)] }.into(),
         Submit {
@@ -156,7 +177,14 @@ pub fn all() -> Vec<(String, Message)> {
             jobs_repeated: 3,
             elapsed_us: 1,
             report: report(),
-            workers: vec![WorkerShare { name: text(), jobs: 36_000, cost_us: 7 }],
+            workers: vec![WorkerShare {
+                name: text(),
+                jobs: 36_000,
+                cost_us: 7,
+                first_us: 8,
+                last_us: 9,
+                timesheet: timesheet(),
+            }],
         }
         .into(),
         ShotFailed { shot, reason: text() }.into(),
@@ -289,7 +317,8 @@ pub fn any_message() -> impl Strategy<Value = Message> {
     let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
         .prop_map(|([lease, cost_us, rays, steps, fallbacks], below_ground, pixels, check)| {
             let report = RenderReport { cost_us, rays, steps, fallbacks, below_ground };
-            Done { lease: LeaseId(lease), report, check, pixels }.into()
+            let timesheet = Timesheet { idle_us: cost_us, redo_us: steps, ..timesheet() };
+            Done { lease: LeaseId(lease), report, timesheet, check, pixels }.into()
         });
     let failed = (any::<u64>(), ".{0,300}")
         .prop_map(|(lease, reason)| Failed { lease: LeaseId(lease), reason }.into());

@@ -1,4 +1,4 @@
-//! The chart of speed against accuracy: numbers to shapes.
+//! The chart of speed against accuracy: numbers to shapes. That of more workers is `stack`.
 //!
 //! Two panels, both logarithmic: time to the right, error upward, so that better is lower
 //! left. One colour and one marker a method; the settings of a method are joined, what is
@@ -7,6 +7,7 @@
 //! them in: both show the same picture, and neither needs a font or a library.
 
 mod pixels;
+pub mod stack;
 mod strokes;
 mod svg;
 
