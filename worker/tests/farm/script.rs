@@ -68,7 +68,7 @@ impl Coordinator {
     pub async fn welcome_with(&self, silence: Duration) -> Peer {
         let accepted = tokio::time::timeout(PATIENCE, self.listener.accept());
         let (stream, _) = accepted.await.expect("a worker connects").unwrap();
-        let greeting = accept(stream, "terrafarm test", PATIENCE).await.unwrap();
+        let greeting = accept(stream, None, "terrafarm test", PATIENCE).await.unwrap();
         let (connection, hello) = greeting.welcome(1, "tower", silence / 3, silence).await.unwrap();
         Peer { connection, hello, asked: Vec::new() }
     }
