@@ -12,6 +12,7 @@ mod farm;
 mod input;
 mod place;
 mod progress;
+mod secret;
 mod shot;
 
 use clap::Parser;

@@ -45,6 +45,9 @@ pub enum HandshakeError {
          trust, say --plain on both sides"
     )]
     NoToken,
+    /// So many greetings were under way that this one had to give way.
+    #[error("it did not greet before others needed its place")]
+    Crowded,
     /// No answer in time.
     #[error("the peer did not greet within {} ms; is it a terrafarm port?", .0.as_millis())]
     TimedOut(Duration),
