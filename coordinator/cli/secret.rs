@@ -26,10 +26,7 @@ pub enum Source {
 
 /// How a coordinator knows its peers. One that others can reach, and only that, makes a
 /// token where there is none.
-pub fn to_serve(
-    security: &Security,
-    reachable: bool,
-) -> anyhow::Result<(Trust, Option<Source>)> {
+pub fn to_serve(security: &Security, reachable: bool) -> anyhow::Result<(Trust, Option<Source>)> {
     if security.plain {
         return Ok((Trust::Network, None));
     }
@@ -71,7 +68,8 @@ fn find(security: &Security) -> anyhow::Result<Option<(FarmToken, Source)>> {
         let token = text.parse().with_context(|| format!("the variable {VARIABLE} is no token"))?;
         return Ok(Some((token, Source::Variable)));
     }
-    let path = default_file()?;
+    // A user without such a folder has no token in it.
+    let Ok(path) = default_file() else { return Ok(None) };
     Ok(read(&path)?.map(|token| (token, Source::File(path))))
 }
 
@@ -135,7 +133,8 @@ pub fn keep(path: &Path, token: &FarmToken) -> anyhow::Result<()> {
         Ok(())
     };
     write().map_err(|error: std::io::Error| {
-        anyhow::Error::new(error).context(format!("cannot keep the farm token in {}", path.display()))
+        anyhow::Error::new(error)
+            .context(format!("cannot keep the farm token in {}", path.display()))
     })
 }
 

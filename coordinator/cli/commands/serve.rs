@@ -19,9 +19,9 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
     let (trust, source) = secret::to_serve(&args.security, !is_this_pc(address.ip()))?;
     runtime()?.block_on(async {
-        let listener = TcpListener::bind(address)
-            .await
-            .with_context(|| format!("cannot listen on {address}; is another coordinator running there?"))?;
+        let listener = TcpListener::bind(address).await.with_context(|| {
+            format!("cannot listen on {address}; is another coordinator running there?")
+        })?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
         announce(address, &trust, source.as_ref());
         let config = Config {
