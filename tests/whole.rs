@@ -14,6 +14,10 @@ mod tidy;
 #[path = "whole/farm.rs"]
 mod farm;
 
+/// Whoever has not the token, floods, dawdles or lies harms nobody who works.
+#[path = "whole/hostile.rs"]
+mod hostile;
+
 /// What is wrong is said, nothing half-written stays, the exit code is 2.
 #[path = "whole/bad_input.rs"]
 mod bad_input;

@@ -36,6 +36,8 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Render for a coordinator until told to stop
     Worker(Worker),
+    /// Print the farm token of this PC, made if there is none; or enter that of a farm
+    Token(Token),
     /// Say how far two pictures, or two folders of numbered pictures, are apart
     Compare(Compare),
     /// Run the real scheduler on a virtual clock, with workers that fail
@@ -222,6 +224,29 @@ pub struct Synth {
     pub json: bool,
 }
 
+/// How links to other PCs are secured.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Security {
+    /// File with the farm token [default: the variable TERRAFARM_TOKEN, else the file of
+    /// "terrafarm token"]
+    #[arg(long, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+    /// Links that are neither encrypted nor authenticated, on a network you trust
+    #[arg(long, conflicts_with = "token_file")]
+    pub plain: bool,
+}
+
+/// `terrafarm token`
+#[derive(Debug, ClapArgs)]
+pub struct Token {
+    /// File with the farm token [default: one in the user's configuration folder]
+    #[arg(long, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+    /// Take the token from a line of standard input and keep it here
+    #[arg(long)]
+    pub enter: bool,
+}
+
 /// `terrafarm render`
 #[derive(Debug, ClapArgs)]
 pub struct Render {
@@ -254,6 +279,9 @@ pub struct Render {
     /// Farm to render on [default: local workers]
     #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
     pub coordinator: Option<String>,
+    /// How the link to the farm is secured
+    #[command(flatten)]
+    pub security: Security,
     /// Local worker processes, when there is no farm [default: one a core, at most 8]
     #[arg(long, conflicts_with = "coordinator", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub workers: Option<u32>,
@@ -286,9 +314,9 @@ pub struct Coordinator {
     /// Address to listen on
     #[arg(long, default_value = "127.0.0.1:7070")]
     pub listen: SocketAddr,
-    /// Allow links that are neither encrypted nor authenticated beyond this machine
-    #[arg(long)]
-    pub plain: bool,
+    /// How links are secured
+    #[command(flatten)]
+    pub security: Security,
     /// Memory for terrain tiles on their way to workers, MiB
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
     pub blob_memory: u64,
@@ -305,6 +333,9 @@ pub struct Worker {
         default_value = "127.0.0.1:7070"
     )]
     pub coordinator: String,
+    /// How the link is secured
+    #[command(flatten)]
+    pub security: Security,
     /// Name shown to people [default: this PC's name]
     #[arg(long)]
     pub name: Option<String>,

@@ -93,7 +93,7 @@ fn start_worker(address: SocketAddr, number: u32, threads: u32) -> anyhow::Resul
     let program = std::env::current_exe().context("cannot find this program's own file")?;
     Command::new(&program)
         .arg("worker")
-        .args(["--coordinator", &address.to_string()])
+        .args(["--coordinator", &address.to_string(), "--plain"])
         .args(["--name", &format!("local-{number}")])
         .args(["--threads", &threads.to_string()])
         // The store is on this PC already: a second copy on disk would serve nobody.

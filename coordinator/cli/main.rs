@@ -13,6 +13,7 @@ mod input;
 mod notify;
 mod place;
 mod progress;
+mod secret;
 mod shot;
 
 use clap::Parser;

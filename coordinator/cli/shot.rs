@@ -24,6 +24,7 @@ use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
 use terrafarm_film::OrderedFrames;
 use terrafarm_terrain::store::{StoreReader, hash_of};
+use terrafarm_wire::link::Trust;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
@@ -151,8 +152,8 @@ impl Plan {
 pub enum Farm {
     /// Worker processes on this PC.
     Local(Crew),
-    /// A coordinator somewhere.
-    Remote(String),
+    /// A coordinator somewhere, and how it is known.
+    Remote(String, Trust),
 }
 
 /// What became of a shot.
@@ -196,11 +197,11 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let sink = sink::open(&plan.output, spec, plan.encoder)?;
     let farm = match &plan.farm {
         Farm::Local(crew) => Some(LocalFarm::start(*crew).await?),
-        Farm::Remote(_) => None,
+        Farm::Remote(..) => None,
     };
-    let address = match (&plan.farm, &farm) {
-        (Farm::Remote(address), _) => address.clone(),
-        (Farm::Local(_), Some(farm)) => farm.address.to_string(),
+    let (address, trust) = match (&plan.farm, &farm) {
+        (Farm::Remote(address, trust), _) => (address.clone(), trust.clone()),
+        (Farm::Local(_), Some(farm)) => (farm.address.to_string(), Trust::Loopback),
         (Farm::Local(_), None) => unreachable!("a local farm was started above"),
     };
     let stop = CancellationToken::new();
@@ -248,7 +249,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
             stop.cancel();
         }
     });
-    let rendered = client::render(&address, submission, updates, taken_out, stop).await;
+    let rendered = client::render(&address, &trust, submission, updates, taken_out, stop).await;
     interrupt.abort();
     give_up.abort();
     hint.abort();

@@ -12,7 +12,7 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
-use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox};
+use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox, Trust};
 use terrafarm_wire::message::{
     Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
     Progress, Role, ShotDone, Submit, WantBlobs,
@@ -113,13 +113,14 @@ pub enum ClientError {
     Stopped,
 }
 
-/// Submits a shot and carries it to its end. Frames arrive in any order on `updates`; each
+/// Submits a shot over a link that `trust` allows, and carries it to its end. Frames arrive in any order on `updates`; each
 /// has to be answered on `taken`, else no further ones come.
 ///
 /// # Errors
 /// If there is no coordinator, it refuses, it is lost, or `stop` is cancelled.
 pub async fn render(
     address: &str,
+    trust: &Trust,
     submission: Submission,
     updates: mpsc::Sender<Update>,
     mut taken: mpsc::Receiver<FrameIndex>,
@@ -136,9 +137,11 @@ pub async fn render(
     };
     let _ = stream.set_nodelay(true);
     let hello = Hello::new(&submission.name, Role::Client);
-    let (connection, welcome) = link::greet(stream, hello, GREETING_LIMIT)
-        .await
-        .map_err(|source| ClientError::Handshake { address: address.into(), source })?;
+    let refused = |source| ClientError::Handshake { address: address.into(), source };
+    let peer = stream.peer_addr().map_err(|error| refused(LinkError::Io(error).into()))?;
+    let token = trust.token_for(peer.ip()).map_err(refused)?;
+    let (connection, welcome) =
+        link::greet(stream, token, hello, GREETING_LIMIT).await.map_err(refused)?;
     let silence = Duration::from_micros(welcome.silence_us);
     let (mut reader, writer) = connection.split();
     let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);

@@ -9,10 +9,11 @@ use crate::farm::{Farm, Out, Peer, PeerEvent};
 use crate::peer::{self, Admission};
 use std::collections::HashMap;
 use std::future::Future;
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::Outbox;
+use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -36,6 +37,11 @@ pub struct Config {
     pub blob_memory_bytes: usize,
     /// Most connections at once, greeting or greeted.
     pub connections_max: usize,
+    /// Whom it lets in.
+    pub trust: Trust,
+    /// Most connections that have not greeted yet; the oldest of them gives way to a new
+    /// one.
+    pub strangers_max: usize,
     /// How long a stranger may take to greet.
     pub greeting_limit: Duration,
     /// Seed of the scheduler.
@@ -50,6 +56,8 @@ impl Default for Config {
             name: "terrafarm".into(),
             blob_memory_bytes: 512 << 20,
             connections_max: 4608,
+            trust: Trust::Loopback,
+            strangers_max: 256,
             greeting_limit: Duration::from_secs(5),
             seed: 1,
             scheduler: terrafarm_sched::Config::default(),
@@ -63,6 +71,12 @@ pub enum CoordinatorError {
     /// The listening socket is of no use.
     #[error("cannot read the address listened on: {0}")]
     Listener(std::io::Error),
+    /// Other PCs can reach it, and it could not tell friends from strangers.
+    #[error(
+        "{0} can be reached from other PCs, and there is no farm token to tell friends from \
+         strangers; give one, or say --plain on a network you trust"
+    )]
+    NoToken(SocketAddr),
 }
 
 /// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
@@ -76,7 +90,10 @@ pub async fn run(
     listener: TcpListener,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
-    listener.local_addr().map_err(CoordinatorError::Listener)?;
+    let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
+    if matches!(config.trust, Trust::Loopback) && !is_this_pc(address.ip()) {
+        return Err(CoordinatorError::NoToken(address));
+    }
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();

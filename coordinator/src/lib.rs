@@ -13,5 +13,6 @@ mod farm;
 mod peer;
 mod shots;
 pub mod sink;
+mod strangers;
 
 pub use driver::{Config, CoordinatorError, run};

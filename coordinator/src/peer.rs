@@ -2,12 +2,13 @@
 
 use crate::driver::{Config, ToDriver, peer_of};
 use crate::farm::{Greeting, PeerEvent};
+use crate::strangers::Strangers;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, LinkError, handshake};
+use terrafarm_wire::link::{self, HandshakeError, LinkError, Trust, handshake};
 use terrafarm_wire::message::{Message, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
@@ -28,7 +29,9 @@ pub struct Admission {
     greeting_limit: Duration,
     heartbeat: Duration,
     silence: Duration,
+    trust: Trust,
     seats: Arc<Semaphore>,
+    strangers: Arc<Strangers>,
     last_id: Arc<AtomicU64>,
     events: mpsc::Sender<ToDriver>,
 }
@@ -49,7 +52,9 @@ impl Admission {
             greeting_limit: config.greeting_limit,
             heartbeat: Duration::from_micros(config.scheduler.heartbeat_us),
             silence: Duration::from_micros(config.scheduler.silence_us),
+            trust: config.trust.clone(),
             seats: Arc::new(Semaphore::new(config.connections_max)),
+            strangers: Arc::new(Strangers::new(config.strangers_max)),
             last_id: Arc::default(),
             events,
         }
@@ -70,8 +75,7 @@ pub async fn serve(
 ) {
     // Grants are small and must not wait for company.
     let _ = stream.set_nodelay(true);
-    let program = handshake::program();
-    let greeted = match link::accept(stream, &program, admission.greeting_limit).await {
+    let greeted = match hear(stream, address, &admission).await {
         Ok(greeted) => greeted,
         Err(why) => {
             tracing::info!(%address, "connection refused: {why}");
@@ -98,7 +102,7 @@ pub async fn serve(
     let writing = tokio::spawn(writer.run(queues));
     let traits = PeerTraits {
         greeting: Greeting { name: hello.name, threads },
-        loopback: address.ip().is_loopback(),
+        loopback: link::is_this_pc(address.ip()),
     };
     if admission.events.send(ToDriver::Open(peer, outbox, hang_up.clone(), traits)).await.is_err() {
         return;
@@ -137,5 +141,20 @@ pub async fn serve(
     let mut writing = writing;
     if tokio::time::timeout(admission.greeting_limit, &mut writing).await.is_err() {
         writing.abort();
+    }
+}
+
+/// Hears a stranger out, for so long as newer ones leave it its place.
+async fn hear(
+    stream: TcpStream,
+    address: SocketAddr,
+    admission: &Admission,
+) -> Result<link::Greeting<TcpStream>, HandshakeError> {
+    let token = admission.trust.token_for(address.ip())?;
+    let program = handshake::program();
+    let place = admission.strangers.enter();
+    tokio::select! {
+        () = place.given_away() => Err(HandshakeError::Crowded),
+        greeted = link::accept(stream, token, &program, admission.greeting_limit) => greeted,
     }
 }

@@ -4,6 +4,7 @@ use crate::support::{Dir, Running, World, coordinator, run, succeed, terrafarm, 
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::path::Path;
 use std::time::Duration;
 
 /// An import that must fail: the message names what matters and nothing is left.
@@ -207,9 +208,23 @@ fn a_coordinator_that_is_not_there_is_named() {
 }
 
 #[test]
-fn a_coordinator_open_to_the_network_must_be_asked_for() {
-    let (_, stderr) = run(terrafarm().args(["coordinator", "--listen", "0.0.0.0:0"]), 2);
-    assert!(stderr.contains("--plain"), "{stderr}");
+fn a_token_that_is_not_there_or_has_a_typo_is_named_and_not_repeated() {
+    let dir = Dir::new();
+    let file = dir.path("farm.token");
+    let token = succeed(terrafarm().args(["token", "--token-file"]).arg(&file));
+    let worker = |file: &Path| {
+        let mut command = terrafarm();
+        command.args(["worker", "--once", "--coordinator", "127.0.0.1:1", "--token-file"]);
+        run(command.arg(file), 2).1
+    };
+    let said = worker(&dir.path("absent"));
+    assert!(said.contains("absent") && said.contains("terrafarm token --enter"), "{said}");
+    let end = if token.trim().ends_with('Z') { "X" } else { "Z" };
+    let typo = format!("{}{end}", &token.trim()[..token.trim().len() - 1]);
+    let said = worker(&dir.write("typo.token", &typo));
+    assert!(said.contains("group 8 of 8") && !said.contains(&typo), "{said}");
+    let said = run(terrafarm().arg("token").env("XDG_CONFIG_HOME", "/dev/null"), 2).1;
+    assert!(said.contains("farm.token"), "{said}");
 }
 
 #[test]

@@ -30,7 +30,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use terrafarm_terrain::cache::BlobCache;
-use terrafarm_wire::link::{Connection, HandshakeError, greet};
+use terrafarm_wire::link::{Connection, HandshakeError, Trust, greet, is_this_pc};
 use terrafarm_wire::message::{Hello, Role, Welcome};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -45,6 +45,8 @@ const CONNECT_LIMIT: Duration = Duration::from_secs(10);
 pub struct WorkerConfig {
     /// Address of the coordinator, `host:port`.
     pub coordinator: String,
+    /// How it and the coordinator know each other.
+    pub trust: Trust,
     /// What to call this worker; a host name, usually.
     pub name: String,
     /// Number of render threads, at least 1.
@@ -94,6 +96,14 @@ pub enum WorkerError {
         /// Why, and what to do.
         text: String,
     },
+    /// The coordinator is on another PC, and there is no farm token.
+    #[error("coordinator {address}: {why}")]
+    NoToken {
+        /// The address of the coordinator.
+        address: String,
+        /// What to do.
+        why: HandshakeError,
+    },
     /// The operating system gives no threads.
     #[error("cannot start {threads} render threads: {why}; try fewer")]
     Threads {
@@ -137,13 +147,15 @@ async fn work<C: Caster>(
 ) -> Result<Ended, WorkerError> {
     let mut site = site(&config, caster).await?;
     let mut backoff = Backoff::new(config.reconnect, config.seed);
+    let mut welcomed = false;
     loop {
         let why = match connect(&config, &stop).await {
             Ok(None) => return Ok(Ended::Stopped),
             Ok(Some((connection, welcome, peer))) => {
                 info!(coordinator = welcome.coordinator, peer = %peer, "connected");
                 backoff.reset();
-                let shift = Shift::new(&mut site, !peer.ip().is_loopback(), &welcome);
+                welcomed = true;
+                let shift = Shift::new(&mut site, !is_this_pc(peer.ip()), &welcome);
                 match shift.work(connection, &stop).await {
                     Ok(()) if stop.is_cancelled() => return Ok(Ended::Stopped),
                     Ok(()) => return Ok(Ended::Drained),
@@ -153,6 +165,16 @@ async fn work<C: Caster>(
             Err(HandshakeError::Refused { refusal, text }) if !refusal.is_temporary() => {
                 let address = config.coordinator;
                 return Err(WorkerError::Refused { address, text });
+            }
+            // Anyone on the way can say this: a token that was right once is right.
+            Err(why @ HandshakeError::TurnedAway(refusal))
+                if !welcomed && !refusal.is_temporary() =>
+            {
+                let (address, text) = (config.coordinator, why.to_string());
+                return Err(WorkerError::Refused { address, text });
+            }
+            Err(why @ HandshakeError::NoToken) => {
+                return Err(WorkerError::NoToken { address: config.coordinator, why });
             }
             Err(error) => error.to_string(),
         };
@@ -214,7 +236,8 @@ async fn connect(
         let threads = config.threads.max(1) as u32;
         let role = Role::Worker { threads, incarnation: config.seed };
         let hello = Hello::new(&config.name, role);
-        let (connection, welcome) = greet(stream, hello, CONNECT_LIMIT).await?;
+        let token = config.trust.token_for(peer.ip())?;
+        let (connection, welcome) = greet(stream, token, hello, CONNECT_LIMIT).await?;
         Ok((connection, welcome, peer))
     };
     tokio::select! {

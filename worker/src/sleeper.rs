@@ -77,7 +77,7 @@ impl Sleeper {
         let stream = stream.map_err(LinkError::Io)?;
         stream.set_nodelay(true).map_err(LinkError::Io)?;
         let hello = Hello::new(name, Role::Worker { threads: 1, incarnation });
-        let (connection, _welcome) = greet(stream, hello, CONNECT_LIMIT).await?;
+        let (connection, _welcome) = greet(stream, None, hello, CONNECT_LIMIT).await?;
         Ok(Sleeper { connection, job })
     }
 

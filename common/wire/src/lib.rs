@@ -11,8 +11,11 @@
 //! reply by position. Whatever a peer sends, it gets an error, never a panic, and
 //! nothing is allocated for a length that has not been checked against its limit.
 //!
+//! Links between PCs are encrypted, and both sides prove that they have the same
+//! [`link::FarmToken`] before a message travels.
+//!
 //! Not here: who may send what when (the worker's session and the coordinator's driver
-//! know that), and encryption.
+//! know that), and where a token is kept.
 
 pub mod codec;
 pub mod frame;

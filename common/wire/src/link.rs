@@ -4,20 +4,30 @@
 //! into a [`Reader`] and a [`Writer`]. The rest of the program sees whole messages.
 //! [`outbox()`] keeps small messages from waiting behind long ones.
 //!
+//! With a [`FarmToken`] everything is encrypted and both sides prove that they have it
+//! before the first message (`channel`); [`Trust`] says where a link may do without.
+//!
 //! A stream that ends between two messages is a clean end, `Ok(None)`; one that ends
 //! inside a message is an error, and the difference is kept.
 
+mod channel;
 pub mod handshake;
 pub mod outbox;
+mod token;
+mod trust;
 
+pub use channel::ChannelError;
 pub use handshake::{Greeting, HandshakeError, accept, greet, program};
 pub use outbox::{Outbox, OutboxEnd, Unsent, outbox};
+pub use token::{FarmToken, NoRandomness, TOKEN_BYTES, TokenError};
+pub use trust::{Trust, is_this_pc};
 
 use crate::codec::{Decoder, Phase, WireError, encode};
 use crate::frame::EncodedFrame;
 use crate::limits::NEWEST_VERSION;
 use crate::message::Message;
 use bytes::{Buf, BytesMut};
+use channel::{Opener, RECORD_BYTES_MAX, RECORD_MAX, Sealer};
 use std::io;
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
@@ -32,6 +42,9 @@ pub enum LinkError {
     /// The peer sent what it must not, or we were about to.
     #[error(transparent)]
     Wire(#[from] WireError),
+    /// What came over a secure link is not what the peer sealed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
     /// The stream ended inside a message: the peer died.
     #[error("the peer vanished in the middle of a message")]
     Cut,
@@ -61,9 +74,17 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
                 buffer: BytesMut::new(),
                 decoder,
                 heard: Instant::now(),
+                secure: None,
             },
-            writer: Writer { stream: write, version: NEWEST_VERSION },
+            writer: Writer { stream: write, version: NEWEST_VERSION, secure: None },
         }
+    }
+
+    /// From now on all bytes of both directions are records of a channel. Nothing has
+    /// been read beyond its openings.
+    fn secure(&mut self, sealer: Sealer, opener: Opener) {
+        self.writer.secure = Some((sealer, BytesMut::new()));
+        self.reader.secure = Some((opener, BytesMut::new()));
     }
 
     /// The handshake is over: both sides speak this version now.
@@ -96,6 +117,8 @@ pub struct Reader<R> {
     decoder: Decoder,
     /// When the last byte came.
     heard: Instant,
+    /// Of a secure link: what opens its records, and what has arrived of them.
+    secure: Option<(Opener, BytesMut)>,
 }
 
 impl<R: AsyncRead + Unpin> Reader<R> {
@@ -118,7 +141,17 @@ impl<R: AsyncRead + Unpin> Reader<R> {
             if let Some(message) = self.decoder.decode(&mut self.buffer)? {
                 return Ok(Some(message));
             }
-            let read = self.stream.read_buf(&mut self.buffer);
+            let arrived = match &mut self.secure {
+                None => &mut self.buffer,
+                Some((opener, arrived)) => {
+                    if opener.open(arrived, &mut self.buffer)? {
+                        continue;
+                    }
+                    arrived.reserve(RECORD_BYTES_MAX.saturating_sub(arrived.len()).max(1));
+                    arrived
+                }
+            };
+            let read = self.stream.read_buf(arrived);
             let count = match silence {
                 None => read.await?,
                 Some(limit) => {
@@ -127,7 +160,8 @@ impl<R: AsyncRead + Unpin> Reader<R> {
                 }
             };
             if count == 0 {
-                let clean = self.buffer.is_empty() && !self.decoder.is_inside_message();
+                let whole = self.secure.as_ref().is_none_or(|(_, arrived)| arrived.is_empty());
+                let clean = whole && self.buffer.is_empty() && !self.decoder.is_inside_message();
                 return if clean { Ok(None) } else { Err(LinkError::Cut) };
             }
             self.heard = Instant::now();
@@ -140,6 +174,8 @@ impl<R: AsyncRead + Unpin> Reader<R> {
 pub struct Writer<W> {
     stream: W,
     version: u16,
+    /// Of a secure link: what makes its records, and those to be written.
+    secure: Option<(Sealer, BytesMut)>,
 }
 
 impl<W: AsyncWrite + Unpin> Writer<W> {
@@ -160,12 +196,28 @@ impl<W: AsyncWrite + Unpin> Writer<W> {
 
     /// Writes one frame: start and payload together where the stream can.
     async fn write(&mut self, frame: EncodedFrame) -> Result<(), LinkError> {
-        let mut bytes = frame.start.chain(frame.payload);
-        while bytes.has_remaining() {
-            if self.stream.write_buf(&mut bytes).await? == 0 {
-                return Err(io::Error::from(io::ErrorKind::WriteZero).into());
-            }
+        let Some((sealer, records)) = &mut self.secure else {
+            return write_all(&mut self.stream, &mut frame.start.chain(frame.payload)).await;
+        };
+        // Record by record, so that the first one is on its way while the next is sealed.
+        records.clear();
+        sealer.seal(&frame.start, records)?;
+        for piece in frame.payload.chunks(RECORD_MAX) {
+            sealer.seal(piece, records)?;
+            write_all(&mut self.stream, records).await?;
         }
-        Ok(())
+        write_all(&mut self.stream, records).await
     }
+}
+
+async fn write_all(
+    stream: &mut (impl AsyncWrite + Unpin),
+    bytes: &mut impl Buf,
+) -> Result<(), LinkError> {
+    while bytes.has_remaining() {
+        if stream.write_buf(bytes).await? == 0 {
+            return Err(io::Error::from(io::ErrorKind::WriteZero).into());
+        }
+    }
+    Ok(())
 }

@@ -7,6 +7,7 @@ mod render;
 mod serve;
 mod simulate;
 mod terrain;
+mod token;
 
 use serve::runtime;
 pub use serve::stop_signal;
@@ -27,6 +28,7 @@ pub fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Render(args) => render::run(&args),
         Command::Coordinator(args) => serve::coordinator(&args),
         Command::Worker(args) => serve::worker(args),
+        Command::Token(args) => token::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Bench(args) => bench::run(&args),

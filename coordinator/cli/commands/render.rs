@@ -2,6 +2,7 @@
 
 use crate::farm::Crew;
 use crate::input::scene::Scene;
+use crate::secret;
 use crate::shot::{self, Choice, FRAMES_IN_FLIGHT, Farm, Plan, Report};
 use crate::{Outcome, args};
 use anyhow::Context;
@@ -43,7 +44,7 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
             args::Encoder::Ffmpeg => Encoder::Ffmpeg,
         },
         farm: match &args.coordinator {
-            Some(address) => Farm::Remote(address.clone()),
+            Some(address) => Farm::Remote(address.clone(), secret::to_connect(&args.security)?),
             None => Farm::Local(Crew::fill(args.workers, args.threads)),
         },
         ..Plan::read(&scene, &choice)?

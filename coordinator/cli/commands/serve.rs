@@ -1,10 +1,14 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
+use crate::secret::{self, Source};
 use crate::{Outcome, args, notify};
-use anyhow::{Context, bail};
+use anyhow::Context;
+use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
+use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::{Reconnect, WorkerConfig};
 use tokio::net::TcpListener;
 
@@ -13,28 +17,16 @@ const MIB: u64 = 1 << 20;
 /// Serves a farm until Ctrl-C or SIGTERM.
 pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
-    if !address.ip().is_loopback() && !args.plain {
-        bail!(
-            "{address} can be reached from other PCs, and links are not encrypted or \
-             authenticated yet; on a network you trust, say --plain as well"
-        );
-    }
+    let (trust, source) = secret::to_serve(&args.security, !is_this_pc(address.ip()))?;
     runtime()?.block_on(async {
-        let listener = TcpListener::bind(address)
-            .await
-            .with_context(|| format!("cannot listen on {address}; is another coordinator running there?"))?;
+        let listener = TcpListener::bind(address).await.with_context(|| {
+            format!("cannot listen on {address}; is another coordinator running there?")
+        })?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
-        // "Any address" is no address to connect to: this PC's name is.
-        let reach = if address.ip().is_unspecified() {
-            format!("{}:{}", pc_name(), address.port())
-        } else {
-            address.to_string()
-        };
-        println!("coordinator on {address}");
-        println!("start workers with:  terrafarm worker --coordinator {reach}");
-        println!("render with:         terrafarm render SCENE --flight FLIGHT -o OUT --coordinator {reach}");
+        announce(address, &trust, source.as_ref());
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
+            trust,
             ..Config::default()
         };
         let stop = stop_signal();
@@ -44,10 +36,61 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     })
 }
 
+/// Says where the coordinator listens, and the exact lines that others need. The token
+/// itself is shown to a person at a terminal only, never to a log.
+fn announce(address: SocketAddr, trust: &Trust, source: Option<&Source>) {
+    // "Any address" is no address to connect to: this PC's name is.
+    let reach = if address.ip().is_unspecified() {
+        format!("{}:{}", pc_name(), address.port())
+    } else {
+        address.to_string()
+    };
+    let (before, after) = match (trust, source) {
+        (Trust::Network, _) => (String::new(), " --plain".to_owned()),
+        (Trust::Token(token), _) if std::io::stdout().is_terminal() => {
+            (with_variable(&token.to_text()), String::new())
+        }
+        (Trust::Token(_), Some(Source::File(path))) => {
+            (String::new(), format!(" --token-file {}", quoted(&path.display().to_string())))
+        }
+        _ => (String::new(), String::new()),
+    };
+    println!("coordinator on {address}");
+    println!("start workers with:  {before}terrafarm worker --coordinator {reach}{after}");
+    println!(
+        "render with:         {before}terrafarm render SCENE --flight FLIGHT -o OUT --coordinator {reach}{after}"
+    );
+    match source {
+        Some(Source::File(path)) => println!("farm token:          in {}", path.display()),
+        Some(Source::Variable) => println!("farm token:          from {}", secret::VARIABLE),
+        None => {}
+    }
+}
+
+/// The start of a line that gives a program the token, in the shell of this system.
+fn with_variable(token: &str) -> String {
+    if cfg!(windows) {
+        format!("set \"{}={token}\" && ", secret::VARIABLE)
+    } else {
+        format!("{}={token} ", secret::VARIABLE)
+    }
+}
+
+/// A path as a shell takes it for one word.
+fn quoted(path: &str) -> String {
+    let harmless = |symbol: char| symbol.is_alphanumeric() || "/\\:._-+~".contains(symbol);
+    match path.chars().all(harmless) {
+        true => path.to_owned(),
+        false if cfg!(windows) => format!("\"{path}\""),
+        false => format!("'{}'", path.replace('\'', "'\\''")),
+    }
+}
+
 /// Works until Ctrl-C or SIGTERM, or with `--once` until the coordinator goes away.
 pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     let config = WorkerConfig {
+        trust: secret::to_connect(&args.security)?,
         coordinator: args.coordinator,
         name: args.name.unwrap_or_else(pc_name),
         threads: args.threads.unwrap_or(cores) as usize,

@@ -147,7 +147,7 @@ async fn a_refusal_for_good_ends_the_worker_and_a_temporary_one_does_not() {
     let running = start(coordinator.config(None));
     for refusal in [Refusal::Full, Refusal::Version] {
         let (stream, _) = coordinator.listener.accept().await.unwrap();
-        let greeting = accept(stream, "terrafarm test", PATIENCE).await.unwrap();
+        let greeting = accept(stream, None, "terrafarm test", PATIENCE).await.unwrap();
         greeting.refuse(refusal, "upgrade the worker").await;
     }
     let error = running.ended.await.unwrap().unwrap_err();

@@ -9,7 +9,7 @@ use terrafarm_common::region::Region;
 use terrafarm_raycast::{Rendered, Stats, Unfit, Unseen, View};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_wire::Message;
-use terrafarm_wire::link::{Connection, accept};
+use terrafarm_wire::link::{Connection, Trust, accept};
 use terrafarm_wire::message::{Blob, Hello, NoBlob, WantBlobs};
 use terrafarm_worker::render::Scene;
 use terrafarm_worker::{Caster, Ended, RayCaster, Reconnect, WorkerConfig, WorkerError, run_with};
@@ -47,6 +47,7 @@ impl Coordinator {
     pub fn config(&self, cache_dir: Option<&Path>) -> WorkerConfig {
         WorkerConfig {
             coordinator: self.listener.local_addr().unwrap().to_string(),
+            trust: Trust::Loopback,
             name: "pc-1".to_owned(),
             threads: 2,
             cache_dir: cache_dir.map(Path::to_owned),
@@ -68,7 +69,7 @@ impl Coordinator {
     pub async fn welcome_with(&self, silence: Duration) -> Peer {
         let accepted = tokio::time::timeout(PATIENCE, self.listener.accept());
         let (stream, _) = accepted.await.expect("a worker connects").unwrap();
-        let greeting = accept(stream, "terrafarm test", PATIENCE).await.unwrap();
+        let greeting = accept(stream, None, "terrafarm test", PATIENCE).await.unwrap();
         let (connection, hello) = greeting.welcome(1, "tower", silence / 3, silence).await.unwrap();
         Peer { connection, hello, asked: Vec::new() }
     }

@@ -115,6 +115,10 @@ pub enum Refusal {
     Closing,
     /// The greeting was not one.
     Malformed,
+    /// The farm token was not proved.
+    Token,
+    /// There is a token on the other side only.
+    PlainOnly,
 }
 
 impl Refusal {

@@ -9,5 +9,7 @@ mod golden;
 mod hostile;
 /// Every message arrives as it was sent.
 mod round_trip;
-/// One suite over TCP and over memory: greetings, ends, silence, heartbeats.
+/// Who has not the token gets nothing; what was changed on the way is noticed.
+mod secure;
+/// One suite over TCP and over memory, plain and secure: greetings, ends, silence, heartbeats.
 mod transport;

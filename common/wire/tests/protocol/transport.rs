@@ -5,17 +5,26 @@ use std::time::Duration;
 use terrafarm_common::id::BlobHash;
 use terrafarm_wire::Message;
 use terrafarm_wire::limits::PART_BYTES;
-use terrafarm_wire::link::{Connection, HandshakeError, LinkError, Unsent, accept, greet, outbox};
+use terrafarm_wire::link::{
+    Connection, FarmToken, HandshakeError, LinkError, Unsent, accept, greet, outbox,
+};
 use terrafarm_wire::message::*;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, DuplexStream, duplex};
 use tokio::net::{TcpListener, TcpStream};
 
-const LIMIT: Duration = Duration::from_secs(20);
+pub const LIMIT: Duration = Duration::from_secs(20);
+
+/// Whether a link of the suite is secure.
+type Token = Option<FarmToken>;
+
+pub fn token() -> FarmToken {
+    FarmToken::from_bytes([7; 32])
+}
 
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send + Debug + 'static {}
 impl<S: AsyncRead + AsyncWrite + Unpin + Send + Debug + 'static> Stream for S {}
 
-fn memory() -> (DuplexStream, DuplexStream) {
+pub fn memory() -> (DuplexStream, DuplexStream) {
     duplex(64 << 10)
 }
 
@@ -26,18 +35,26 @@ async fn tcp() -> (TcpStream, TcpStream) {
     (near.unwrap(), far.unwrap().0)
 }
 
-fn hello() -> Hello {
+pub fn hello() -> Hello {
     Hello::new("pc-1", Role::Worker { threads: 4, incarnation: 8 })
 }
 
-async fn connect<S: Stream>((near, far): (S, S)) -> (Connection<S>, Connection<S>) {
+async fn connect<S: Stream>(pair: (S, S)) -> (Connection<S>, Connection<S>) {
+    connect_by(pair, None).await
+}
+
+async fn connect_by<S: Stream>(
+    (near, far): (S, S),
+    token: Token,
+) -> (Connection<S>, Connection<S>) {
+    let token = token.as_ref();
     let coordinator = async {
-        let greeting = accept(far, "terrafarm test", LIMIT).await.unwrap();
+        let greeting = accept(far, token, "terrafarm test", LIMIT).await.unwrap();
         assert_eq!(greeting.hello(), &hello());
         let (beat, silence) = (Duration::from_secs(1), Duration::from_secs(3));
         greeting.welcome(42, "tower", beat, silence).await.unwrap().0
     };
-    let (worker, coordinator) = tokio::join!(greet(near, hello(), LIMIT), coordinator);
+    let (worker, coordinator) = tokio::join!(greet(near, token, hello(), LIMIT), coordinator);
     let (worker, welcome) = worker.unwrap();
     assert_eq!((welcome.id, welcome.version), (42, 1));
     assert_eq!(welcome.silence_us, 3_000_000);
@@ -45,8 +62,8 @@ async fn connect<S: Stream>((near, far): (S, S)) -> (Connection<S>, Connection<S
 }
 
 /// What holds of a connection, whatever it runs over.
-async fn every_message_passes_both_ways<S: Stream>(pair: (S, S)) {
-    let (mut worker, mut coordinator) = connect(pair).await;
+async fn every_message_passes_both_ways<S: Stream>(pair: (S, S), token: Token) {
+    let (mut worker, mut coordinator) = connect_by(pair, token).await;
     for (_, message) in samples::all() {
         worker.send(&message).await.unwrap();
         assert_eq!(coordinator.recv().await.unwrap(), Some(message.clone()));
@@ -55,8 +72,12 @@ async fn every_message_passes_both_ways<S: Stream>(pair: (S, S)) {
     }
 }
 
-async fn a_clean_end_is_told_from_a_death_inside_a_message<S: Stream>(clean: (S, S), cut: (S, S)) {
-    let (worker, mut coordinator) = connect(clean).await;
+async fn a_clean_end_is_told_from_a_death_inside_a_message<S: Stream>(
+    clean: (S, S),
+    cut: (S, S),
+    token: Token,
+) {
+    let (worker, mut coordinator) = connect_by(clean, token).await;
     let (_reader, mut writer) = worker.split();
     writer.send(&Ping { number: 1 }.into()).await.unwrap();
     writer.close().await.unwrap();
@@ -67,28 +88,38 @@ async fn a_clean_end_is_told_from_a_death_inside_a_message<S: Stream>(clean: (S,
     let whole = bytes(&hello().into());
     near.write_all(&whole[..whole.len() - 1]).await.unwrap();
     near.shutdown().await.unwrap();
-    let broken = accept(far, "terrafarm test", LIMIT).await;
+    let broken = accept(far, None, "terrafarm test", LIMIT).await;
     assert!(matches!(broken, Err(HandshakeError::Link(LinkError::Cut))), "{broken:?}");
 }
 
-async fn garbage_is_refused_and_closed<S: Stream>((mut near, far): (S, S)) {
+async fn garbage_is_refused_and_closed<S: Stream>((mut near, far): (S, S), token: Token) {
     near.write_all(b"GET / HTTP/1.1\r\nHost: tower\r\n\r\n").await.unwrap();
-    let refused = accept(far, "terrafarm test", LIMIT).await;
-    assert!(matches!(refused, Err(HandshakeError::Refused { refusal: Refusal::Malformed, .. })));
+    near.shutdown().await.unwrap();
+    let refused = accept(far, token.as_ref(), "terrafarm test", LIMIT).await;
+    let expected = if token.is_some() { Refusal::Token } else { Refusal::Malformed };
+    assert!(
+        matches!(&refused, Err(HandshakeError::Refused { refusal, .. }) if *refusal == expected),
+        "{refused:?}"
+    );
     let mut answer = Vec::new();
-    let _until_closed = near.read_to_end(&mut answer).await;
+    near.read_to_end(&mut answer).await.unwrap();
     assert!(answer.starts_with(b"TFRM"));
 }
 
-async fn another_version_is_told_which_side_to_upgrade<S: Stream>(newer: (S, S), older: (S, S)) {
+async fn another_version_is_told_which_side_to_upgrade<S: Stream>(
+    newer: (S, S),
+    older: (S, S),
+    token: Token,
+) {
+    let token = token.as_ref();
     for (pair, versions, advice) in [
         (newer, Versions { oldest: 7, newest: 9 }, "upgrade the coordinator"),
         (older, Versions { oldest: 0, newest: 0 }, "upgrade the worker"),
     ] {
         let (near, far) = pair;
         let (refused, refusal) = tokio::join!(
-            greet(near, Hello { versions, ..hello() }, LIMIT),
-            accept(far, "terrafarm test", LIMIT),
+            greet(near, token, Hello { versions, ..hello() }, LIMIT),
+            accept(far, token, "terrafarm test", LIMIT),
         );
         assert!(refusal.is_err());
         match refused {
@@ -100,8 +131,8 @@ async fn another_version_is_told_which_side_to_upgrade<S: Stream>(newer: (S, S),
     }
 }
 
-async fn a_long_picture_lets_heartbeats_pass<S: Stream>(pair: (S, S)) {
-    let (worker, coordinator) = connect(pair).await;
+async fn a_long_picture_lets_heartbeats_pass<S: Stream>(pair: (S, S), token: Token) {
+    let (worker, coordinator) = connect_by(pair, token).await;
     let (_keep, writer) = worker.split();
     let (mut reader, _keep_too) = coordinator.split();
     let (queue, end) = outbox(4, 4);
@@ -123,49 +154,52 @@ async fn a_long_picture_lets_heartbeats_pass<S: Stream>(pair: (S, S)) {
 }
 
 macro_rules! transport_suite {
-    ($name:ident, $pair:expr) => {
+    ($name:ident, $pair:expr, $token:expr) => {
         mod $name {
             use super::*;
 
             #[tokio::test]
             async fn every_message_passes_both_ways() {
-                super::every_message_passes_both_ways($pair).await;
+                super::every_message_passes_both_ways($pair, $token).await;
             }
 
             #[tokio::test]
             async fn a_clean_end_is_told_from_a_death_inside_a_message() {
-                super::a_clean_end_is_told_from_a_death_inside_a_message($pair, $pair).await;
+                super::a_clean_end_is_told_from_a_death_inside_a_message($pair, $pair, $token)
+                    .await;
             }
 
             #[tokio::test]
             async fn garbage_is_refused_and_closed() {
-                super::garbage_is_refused_and_closed($pair).await;
+                super::garbage_is_refused_and_closed($pair, $token).await;
             }
 
             #[tokio::test]
             async fn another_version_is_told_which_side_to_upgrade() {
-                super::another_version_is_told_which_side_to_upgrade($pair, $pair).await;
+                super::another_version_is_told_which_side_to_upgrade($pair, $pair, $token).await;
             }
 
             #[tokio::test]
             async fn a_long_picture_lets_heartbeats_pass() {
-                super::a_long_picture_lets_heartbeats_pass($pair).await;
+                super::a_long_picture_lets_heartbeats_pass($pair, $token).await;
             }
         }
     };
 }
 
-transport_suite!(over_memory, memory());
-transport_suite!(over_tcp, tcp().await);
+transport_suite!(over_memory, memory(), None);
+transport_suite!(over_tcp, tcp().await, None);
+transport_suite!(secure_over_memory, memory(), Some(token()));
+transport_suite!(secure_over_tcp, tcp().await, Some(token()));
 
 #[tokio::test(start_paused = true)]
 async fn a_peer_that_says_nothing_costs_one_time_limit() {
     let (near, far) = memory();
-    let late = accept(far, "terrafarm test", LIMIT).await;
+    let late = accept(far, None, "terrafarm test", LIMIT).await;
     assert!(matches!(late, Err(HandshakeError::TimedOut(limit)) if limit == LIMIT));
     drop(near);
     let (near, _far) = memory();
-    let late = greet(near, hello(), LIMIT).await;
+    let late = greet(near, None, hello(), LIMIT).await;
     assert!(matches!(late, Err(HandshakeError::TimedOut(_))));
 }
 
@@ -188,7 +222,7 @@ async fn silence_is_noticed_and_a_trickle_is_not_silence() {
         }
         near
     });
-    let greeting = accept(far, "terrafarm test", LIMIT).await.unwrap();
+    let greeting = accept(far, None, "terrafarm test", LIMIT).await.unwrap();
     assert_eq!(greeting.hello().name, "pc-1");
     trickle.await.unwrap();
 }

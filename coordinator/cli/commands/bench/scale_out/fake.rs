@@ -24,6 +24,7 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Shading, Sky};
 use terrafarm_coordinator::client::{self, Submission, Update};
 use terrafarm_terrain::store::StoreReader;
+use terrafarm_wire::link::Trust;
 use terrafarm_wire::message::ShotDone;
 use terrafarm_worker::sleeper::{GREY, Sleeper, Slept};
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
@@ -277,7 +278,8 @@ async fn submit(address: &str, submission: Submission) -> anyhow::Result<ShotDon
         wrong
     });
     let stop = CancellationToken::new();
-    let done = client::render(address, submission, updates, taken_out, stop).await?;
+    let done =
+        client::render(address, &Trust::Loopback, submission, updates, taken_out, stop).await?;
     let wrong = checking.await.context("the frames were not checked")?;
     ensure!(wrong == 0, "{wrong} frames are not what the workers sent");
     Ok(done)

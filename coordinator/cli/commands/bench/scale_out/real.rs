@@ -34,6 +34,7 @@ use terrafarm_coordinator::client::{self, Submission, Update};
 use terrafarm_coordinator::sink;
 use terrafarm_synth::SynthSpec;
 use terrafarm_terrain::store::{StoreReader, hash_of};
+use terrafarm_wire::link::Trust;
 use terrafarm_wire::message::ShotDone;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -280,7 +281,15 @@ async fn render(
         }
         frames
     });
-    let done = client::render(address, shot, updates, taken_out, CancellationToken::new()).await?;
+    let done = client::render(
+        address,
+        &Trust::Loopback,
+        shot,
+        updates,
+        taken_out,
+        CancellationToken::new(),
+    )
+    .await?;
     Ok((done, keeping.await.context("the frames were not kept")?))
 }
 
