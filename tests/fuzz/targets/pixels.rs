@@ -45,7 +45,8 @@ fn accepts(input: &[u8]) -> bool {
 fn frame_of(pixels: &[u8]) -> Vec<u8> {
     let report = RenderReport { cost_us: 1, rays: 2, steps: 3, fallbacks: 0, below_ground: false };
     let pixels = Pixels::compressed(Bytes::copy_from_slice(pixels)).expect("few pixels");
-    let done = Done { lease: LeaseId(1), report, timesheet: Default::default(), check: None, pixels };
+    let done =
+        Done { lease: LeaseId(1), report, timesheet: Default::default(), check: None, pixels };
     let frames = encode(NEWEST_VERSION, &done.into()).expect("an honest message");
     frames.flat_map(|frame| frame.to_vec()).collect()
 }
