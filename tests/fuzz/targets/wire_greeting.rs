@@ -17,22 +17,16 @@ const PIPE: usize = 64 << 10;
 
 terrafarm_fuzz::target!(seeds(), accepts);
 
+/// Only what changes nothing is accepted.
 fn seeds() -> Vec<Vec<u8>> {
-    let opening = [b"TFRS\x01\0", &[7; 48][..]].concat();
-    let greeting = terrafarm_fuzz::seeds::golden_frames().swap_remove(0);
-    vec![
-        vec![MEDDLE],
-        [&[MEDDLE], &[0; 60][..], &[1]].concat(),
-        [&[0], &opening[..]].concat(),
-        [&[0], &opening[..], &[20, 0], &[3; 20]].concat(),
-        [&[0], &b"TFRS\x02\0"[..]].concat(),
-        [&[0], &greeting[..]].concat(),
-    ]
+    vec![vec![MEDDLE], [&[MEDDLE][..], &[0; 120]].concat()]
 }
 
 fn accepts(input: &[u8]) -> bool {
     let Some((&first, bytes)) = input.split_first() else { return false };
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
+    // Time passes at once where both sides wait for each other.
+    let mut runtime = tokio::runtime::Builder::new_current_thread();
+    let runtime = runtime.enable_time().start_paused(true).build();
     runtime.expect("a runtime").block_on(async {
         if first & MEDDLE == 0 {
             assert!(!is_let_in(bytes).await, "a stranger has got in");
