@@ -4,7 +4,7 @@
 //! along such a line each ray rises more steeply than the one before and begins where that
 //! one ended, whatever the pitch and the roll (after Cohen-Or et al., section 2, whose
 //! columns are those of a camera that does not roll). `lattice` says which lines and rays
-//! there are: neighbours are about four pixels apart for each pixel of tolerance.
+//! there are: neighbours are six pixels apart for each pixel of tolerance, but at most four.
 //!
 //! What rays find is kept as inverse depth, which over a plane is linear in the picture.
 //! There is a ray in each row for each line, so a pixel lies between two rays. Where the
@@ -12,7 +12,8 @@
 //! are further apart than lines, the pixel is between the two (`net`). Where they bend more
 //! it is compared with the surface at that very place, and moved along its own ray until it
 //! is there; where the two see different ground it is looked for on the nearer, then on the
-//! other (`doubts`). What is not found so, and what is close to V, has a ray of its own,
+//! other (`doubts`). Closer ground that ends a few rows below may come to a peak between the
+//! lines: there it is tried first. What is not found so, and what is close to V, has a ray of its own,
 //! that of `lod`. What a pixel can miss is ground in front that is narrower than the
 //! distance between lines.
 
@@ -355,7 +356,7 @@ impl Columns<'_, '_> {
                         _ => {
                             let tips = &tips[places[lane] as usize..];
                             let tip = tips[0].max(tips[1]);
-                            let same = around == [0.0; 2] || net::same(around);
+                            let same = net::same(around);
                             let other = if between[lane] > 0.0 { between[lane] } else { SKY };
                             if same { [tip, other, 0.0] } else { broken(around, Some(tip)) }
                         }
