@@ -5,6 +5,8 @@
 //! this PC.
 
 use crate::support::{Dir, Running, coordinator, run, succeed, terrafarm};
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::net::UnixDatagram;
 use std::path::{Path, PathBuf};
@@ -179,14 +181,28 @@ fn a_container_is_built_from_every_file_of_the_repository_that_the_program_holds
     for path in &copied {
         assert!(root.join(path).exists(), "{path} is copied and does not exist");
     }
-    // Cargo writes what the program was made of beside it.
-    let made_of = fs::read_to_string(format!("{PROGRAM}.d")).unwrap();
-    let root = format!("{}/", root.display());
-    let ours: Vec<_> =
-        made_of.split_whitespace().filter_map(|path| path.strip_prefix(&root)).collect();
-    assert!(ours.contains(&"deploy/scenes/demo.toml"), "{ours:?}");
+    // The compiler writes what each crate was made of, by its path in the repository.
+    let crates = Path::new(PROGRAM).with_file_name("deps");
+    let is_ours = |name: &str| name.starts_with("terrafarm") && name.ends_with(".d");
+    let made_of: String = fs::read_dir(crates)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.file_name().and_then(OsStr::to_str).is_some_and(is_ours))
+        .map(|path| fs::read_to_string(path).unwrap())
+        .collect();
+    let lines = made_of.lines().filter(|line| !line.starts_with('#'));
+    let words = lines.flat_map(str::split_whitespace).map(|word| word.trim_end_matches(':'));
+    // What older builds were made of may be gone.
+    let real = root.canonicalize().unwrap();
+    let ours: BTreeSet<PathBuf> = words
+        .filter(|word| !word.starts_with('/'))
+        .filter_map(|word| root.join(word).canonicalize().ok())
+        .filter_map(|path| path.strip_prefix(&real).ok().map(Path::to_path_buf))
+        .collect();
+    assert!(ours.contains(Path::new("deploy/scenes/demo.toml")), "the scene of the demo is held");
     for path in ours {
-        assert!(copied.iter().any(|folder| path.starts_with(folder)), "{path} is not copied");
+        let is_copied = copied.iter().any(|folder| path.starts_with(folder));
+        assert!(is_copied, "{} is not copied", path.display());
     }
 }
 
