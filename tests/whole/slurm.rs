@@ -22,6 +22,7 @@ fn poll<T>(what: &str, mut attempt: impl FnMut() -> Option<T>) -> T {
             return found;
         }
         assert!(Instant::now() < deadline, "{what} did not come about");
+        // Slurm tells nobody: it has to be asked again, and not without a breath between.
         std::thread::sleep(Duration::from_millis(20));
     }
 }

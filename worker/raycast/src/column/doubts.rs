@@ -2,6 +2,7 @@
 
 use super::{ALLOWED, Columns};
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
+use crate::lattice::Frame;
 use crate::lod::Alone;
 use crate::walk::Slopes;
 use glam::DVec3;
@@ -77,13 +78,9 @@ impl Columns<'_, '_> {
         alone: &mut Vec<Alone>,
     ) {
         let count = doubts.fill();
-        let camera = self.camera;
-        let scale = 1.0 / camera.focal_px();
-        let (right, down) = (camera.right * scale, -camera.up * scale);
-        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-        let corner = camera.forward - right * (0.5 * width) - down * (0.5 * height);
+        let frame = Frame::new(self.camera, true);
         let part = |vector: DVec3| vector.as_vec3().to_array();
-        let (corner, right, down) = (part(corner), part(right), part(down));
+        let (corner, right, down) = (part(frame.corner), part(frame.minor), part(frame.major));
         let half = L::F::splat(0.5);
         let (left, top) = (L::I::splat(self.region.x as i32), L::I::splat(self.region.y as i32));
         for at in (0..count).step_by(L::N) {
