@@ -291,6 +291,9 @@ pub struct Render {
     /// Frames that may be under way at once [default: 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub frames_in_flight: Option<u32>,
+    /// Shots of a higher priority get every worker they can use; equals take turns
+    #[arg(long, default_value_t = 0, allow_negative_numbers = true)]
+    pub priority: i32,
     /// Who encodes MP4
     #[arg(long, value_enum, default_value_t = Encoder::Builtin)]
     pub encoder: Encoder,

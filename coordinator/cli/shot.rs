@@ -64,6 +64,8 @@ pub struct Plan {
     pub fps: f64,
     /// Frames that may be under way at once.
     pub frames_in_flight: u32,
+    /// Shots of a higher priority come first.
+    pub priority: i32,
     /// Where the pictures go.
     pub output: PathBuf,
     /// Who compresses video.
@@ -139,6 +141,7 @@ impl Plan {
             cameras,
             fps: choice.fps,
             frames_in_flight: FRAMES_IN_FLIGHT,
+            priority: 0,
             output: PathBuf::from("."),
             encoder: Encoder::BuiltIn,
             poster: None,
@@ -240,6 +243,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         split: plan.split,
         cameras: plan.cameras.clone(),
         frames_in_flight: plan.frames_in_flight,
+        priority: plan.priority,
     };
     let deserted = farm.as_ref().map_or_else(CancellationToken::new, |farm| farm.deserted.clone());
     let give_up = tokio::spawn({

@@ -50,6 +50,8 @@ pub struct Submission {
     pub cameras: Vec<Camera>,
     /// Frames that may be begun and not yet taken.
     pub frames_in_flight: u32,
+    /// Shots of a higher priority come first.
+    pub priority: i32,
 }
 
 /// What comes back while a shot is rendered.
@@ -284,6 +286,7 @@ impl Submission {
             split: self.split,
             frames: self.cameras.len() as u32,
             frames_in_flight: self.frames_in_flight,
+            priority: self.priority,
         };
         Plan { submit, cameras: self.cameras.clone() }
     }

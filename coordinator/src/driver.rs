@@ -6,10 +6,13 @@
 
 use crate::blobs::ClientId;
 use crate::farm::{Farm, Out, Peer, PeerEvent};
+use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
+use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
@@ -17,7 +20,8 @@ use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -25,6 +29,8 @@ use tokio_util::task::TaskTracker;
 const EVENTS: usize = 1024;
 /// Pause after the system refused to accept a connection (out of file handles, say).
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// How often a new view of the farm is published.
+const LOOK: Duration = Duration::from_millis(250);
 /// How long peers have to hear that the coordinator stops.
 const FAREWELL: Duration = Duration::from_secs(2);
 
@@ -97,7 +103,8 @@ pub async fn run(
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
-    let driver = tasks.spawn(drive(config.clone(), inbox, stop.clone()));
+    let (views, _view) = watch::channel(Arc::default());
+    let driver = tasks.spawn(drive(config.clone(), inbox, views, stop.clone()));
     tokio::pin!(shutdown);
     let admission = Admission::new(&config, events);
     loop {
@@ -126,11 +133,40 @@ pub async fn run(
 }
 
 /// What the driver receives.
+#[expect(clippy::large_enum_variant, reason = "nearly every one is an event")]
 pub enum ToDriver {
     /// A peer has greeted; here is how to answer it.
     Open(Peer, Outbox, CancellationToken, peer::PeerTraits),
     /// Something happened at its connection.
     Event(Peer, PeerEvent),
+    /// Someone at the desk wants something.
+    Order(Order, oneshot::Sender<Result<String, OrderError>>),
+}
+
+/// The way from the desk to the driver.
+#[derive(Clone)]
+#[expect(dead_code, reason = "the desk comes next")]
+pub struct FarmLine {
+    events: mpsc::Sender<ToDriver>,
+    view: watch::Receiver<Arc<FarmView>>,
+}
+
+impl FarmLine {
+    /// Has an order carried out and waits for what came of it.
+    ///
+    /// # Errors
+    /// If it cannot be carried out, or the coordinator is stopping.
+    pub async fn order(&self, order: Order) -> Result<String, OrderError> {
+        let (answer, answered) = oneshot::channel();
+        let sent = self.events.send(ToDriver::Order(order, answer)).await;
+        sent.map_err(|_| OrderError::Stopping)?;
+        answered.await.map_err(|_| OrderError::Stopping)?
+    }
+
+    /// The newest view of the farm.
+    pub fn view(&self) -> Arc<FarmView> {
+        self.view.borrow().clone()
+    }
 }
 
 struct Line {
@@ -140,11 +176,18 @@ struct Line {
     loopback: bool,
 }
 
-async fn drive(config: Config, mut inbox: mpsc::Receiver<ToDriver>, stop: CancellationToken) {
+async fn drive(
+    config: Config,
+    mut inbox: mpsc::Receiver<ToDriver>,
+    views: watch::Sender<Arc<FarmView>>,
+    stop: CancellationToken,
+) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
     let mut farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
+    let mut looks = tokio::time::interval(LOOK);
+    looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
         let due = farm.next_deadline().map(|at| epoch + Duration::from_micros(at.0));
         tokio::select! {
@@ -162,8 +205,18 @@ async fn drive(config: Config, mut inbox: mpsc::Receiver<ToDriver>, stop: Cancel
                         lines.remove(&peer);
                     }
                 }
+                Some(ToDriver::Order(order, answer)) => {
+                    // Who asked may have gone.
+                    let _ = answer.send(farm.order(now(), order));
+                }
                 None => break,
             },
+            _ = looks.tick() => {
+                views.send_if_modified(|view| {
+                    *view = Arc::new(farm.view(now()));
+                    true
+                });
+            }
         }
         while let Some(out) = farm.poll_out() {
             if let Some((peer, why)) = carry(out, &mut lines) {

@@ -4,6 +4,8 @@
 //! and a time, and leaves messages in a queue; it reads no clock and knows no socket. The
 //! driver task (`driver.rs`) owns it and carries the messages.
 
+mod desk;
+
 use crate::blobs::{Broker, ClientId, Order};
 use crate::shots::{FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};

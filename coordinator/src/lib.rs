@@ -10,9 +10,11 @@ mod blobs;
 pub mod client;
 mod driver;
 mod farm;
+pub mod order;
 mod peer;
 mod shots;
 pub mod sink;
 mod strangers;
+pub mod view;
 
 pub use driver::{Config, CoordinatorError, run};

@@ -94,6 +94,8 @@ pub async fn serve(
     let (is_worker, threads) = match hello.role {
         Role::Worker { threads, .. } => (true, threads),
         Role::Client => (false, 0),
+        // Answered by the API, which is not there yet.
+        Role::Desk => return,
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();

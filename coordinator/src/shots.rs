@@ -96,6 +96,11 @@ impl Shots {
         self.shots.get_mut(&shot)
     }
 
+    /// All of them.
+    pub fn iter(&self) -> impl Iterator<Item = (ShotId, &Shot)> {
+        self.shots.iter().map(|(&id, shot)| (id, shot))
+    }
+
     /// Whether the shot is this client's.
     pub fn belongs_to(&self, shot: ShotId, client: ClientId) -> bool {
         self.shots.get(&shot).is_some_and(|state| state.client == client)
@@ -197,7 +202,7 @@ impl Shots {
             width: shot.submit.width,
             height: shot.submit.height,
             split: shot.submit.split,
-            priority: 0,
+            priority: shot.submit.priority,
             frames_in_flight: shot.submit.frames_in_flight,
         };
         Ok(Some((Accepted { number, shot: id }, event)))

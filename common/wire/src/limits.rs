@@ -21,6 +21,8 @@ pub const BLOB_HEAD_MAX: usize = 1 << 10;
 /// Longest head of a message that carries pixels behind it: a summary of their errors
 /// keeps at most [`KEPT_MAX`] values of 14 bytes, 56 KiB.
 pub const PIXELS_HEAD_MAX: usize = 64 << 10;
+/// Longest head of a request to the API or of its answer, bytes.
+pub const DESK_HEAD_MAX: usize = 4 << 10;
 /// Longest payload of one frame, bytes. Longer payloads travel in parts of this size, so
 /// that a heartbeat waits for one part at most: 9 ms on gigabit Ethernet.
 pub const PART_BYTES: usize = 1 << 20;
@@ -29,6 +31,14 @@ pub const PART_BYTES: usize = 1 << 20;
 pub const BLOB_BYTES_MAX: usize = 256 << 20;
 /// Longest picture or piece of one, bytes: the largest frame, uncompressed.
 pub const PIXEL_BYTES_MAX: usize = MAX_SIDE_PX as usize * MAX_SIDE_PX as usize * 3;
+
+/// Longest body of a request to the API or of its answer, bytes: a submission of some
+/// hundred thousand cameras. Longer contents are fetched by range.
+pub const DESK_BODY_MAX: usize = 256 << 20;
+/// Longest path of a request, its query included, bytes.
+pub const PATH_BYTES_MAX: usize = 2 << 10;
+/// Longest content type of an answer, bytes.
+pub const CONTENT_TYPE_BYTES_MAX: usize = 128;
 
 /// Longest name of a program, a worker, a client or a shot, bytes of UTF-8.
 pub const NAME_BYTES_MAX: usize = 256;
@@ -62,6 +72,8 @@ pub enum Class {
     Blob,
     /// A message with pixels behind it.
     Pixels,
+    /// A request to the API, or its answer, with a body behind it.
+    Desk,
 }
 
 impl Class {
@@ -73,6 +85,7 @@ impl Class {
             Class::Submission => SUBMISSION_HEAD_MAX,
             Class::Blob => BLOB_HEAD_MAX,
             Class::Pixels => PIXELS_HEAD_MAX,
+            Class::Desk => DESK_HEAD_MAX,
         }
     }
 
@@ -82,6 +95,7 @@ impl Class {
             Class::Hello | Class::Control | Class::Submission => 0,
             Class::Blob => BLOB_BYTES_MAX,
             Class::Pixels => PIXEL_BYTES_MAX,
+            Class::Desk => DESK_BODY_MAX,
         }
     }
 }
@@ -116,7 +130,14 @@ mod tests {
 
     #[test]
     fn every_length_fits_its_field_of_the_header() {
-        for class in [Class::Hello, Class::Control, Class::Submission, Class::Blob, Class::Pixels] {
+        for class in [
+            Class::Hello,
+            Class::Control,
+            Class::Submission,
+            Class::Blob,
+            Class::Pixels,
+            Class::Desk,
+        ] {
             assert!(u32::try_from(class.head_max()).is_ok());
             assert!(u32::try_from(class.payload_max()).is_ok());
         }

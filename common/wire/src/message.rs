@@ -1,7 +1,8 @@
 //! What travels: every message, by who sends it.
 //!
 //! [`hello`] opens and keeps a connection, [`blob`] moves terrain, [`work`] passes
-//! between coordinator and worker, [`shot`] between client and coordinator. The table at
+//! between coordinator and worker, [`shot`] between client and coordinator, [`desk`] carries
+//! requests to the coordinator's API. The table at
 //! the foot of this file gives each its number, which is never reused.
 //!
 //! A [`Message`] in memory is always fit: the decoder checks it before anyone sees it,
@@ -9,11 +10,13 @@
 //! it, so they cannot get lost or join the wrong kind.
 
 pub mod blob;
+pub mod desk;
 pub mod hello;
 pub mod shot;
 pub mod work;
 
 pub use blob::{Blob, NoBlob, WantBlobs};
+pub use desk::{Request, Response, Verb};
 pub use hello::{Goodbye, Hello, Ping, Pong, Refusal, Refused, Role, Versions, Welcome};
 pub use shot::{
     Accepted, Cameras, Cancel, Frame, FrameFailed, FrameTaken, Progress, Rejected, ShotDone,
@@ -203,6 +206,8 @@ impl Message {
             | Message::Done(_)
             | Message::Frame(_)
             | Message::ShotDone(_)
+            | Message::Request(_)
+            | Message::Response(_)
             | Message::ShotFailed(_)
             | Message::Goodbye(_) => Lane::Bulk,
             _ => Lane::Urgent,
@@ -272,4 +277,9 @@ messages! {
     ShotDone = 0x55, Control;
     /// Coordinator to client: the shot has been given up.
     ShotFailed = 0x56, Control;
+
+    /// Desk to coordinator: something of the API.
+    Request = 0x60, Desk;
+    /// Coordinator to desk: the answer.
+    Response = 0x61, Desk;
 }

@@ -38,6 +38,7 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
         check: args.casting.check,
         split: args.split,
         frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
+        priority: args.priority,
         output: args.output.clone(),
         encoder: match args.encoder {
             args::Encoder::Builtin => Encoder::BuiltIn,

@@ -102,6 +102,31 @@ pub enum Event {
         /// The one that is not wanted.
         shot: ShotId,
     },
+    /// When a shot is to wait: its jobs are revoked at once and none is granted until
+    /// [`Event::ShotResumed`]. What is accepted of its frames is kept.
+    ShotPaused {
+        /// The one that waits.
+        shot: ShotId,
+    },
+    /// When a shot that waited may go on.
+    ShotResumed {
+        /// The one that goes on.
+        shot: ShotId,
+    },
+    /// When a shot gets another priority.
+    ShotPrioritised {
+        /// The shot.
+        shot: ShotId,
+        /// Shots of a higher priority get every worker they can use; equals take turns.
+        priority: i32,
+    },
+    /// When an operator gives a worker that was blocked another chance.
+    WorkerCleared {
+        /// The worker.
+        worker: WorkerId,
+        /// The shot that it was blocked for.
+        shot: ShotId,
+    },
     /// When any bytes have come from a worker. The other events from workers imply it.
     HeardFrom {
         /// The one that lives.

@@ -146,6 +146,15 @@ impl Scheduler {
                 }
             }
             Event::ShotCanceled { shot } => self.forget_shot(shot),
+            Event::ShotPaused { shot } => self.pause(shot),
+            Event::ShotResumed { shot } => {
+                if let Some(known) = self.shots.get_mut(&shot) {
+                    known.is_paused = false;
+                    self.refresh_ready(shot);
+                }
+            }
+            Event::ShotPrioritised { shot, priority } => self.prioritise(shot, priority),
+            Event::WorkerCleared { worker, shot } => self.clear(worker, shot),
             Event::HeardFrom { worker } => self.hear(worker),
             Event::Tick => {}
         }
@@ -285,6 +294,37 @@ impl Scheduler {
             self.end_lease(lease, End::Unwanted);
         }
         self.shots.remove(&shot);
+    }
+
+    /// Stops a shot without forgetting anything: its jobs wait for new leases.
+    fn pause(&mut self, shot: ShotId) {
+        let Some(known) = self.shots.get_mut(&shot) else { return };
+        known.is_paused = true;
+        let jobs = known.running.values();
+        let leases: Vec<LeaseId> = jobs.flat_map(|job| job.leases.iter().copied()).collect();
+        for lease in leases {
+            self.end_lease(lease, End::Barred);
+        }
+        self.refresh_ready(shot);
+    }
+
+    fn prioritise(&mut self, shot: ShotId, priority: i32) {
+        let Some(known) = self.shots.get_mut(&shot) else { return };
+        known.priority = priority;
+        if let Some(key) = known.ready.take() {
+            self.ready.remove(&key);
+        }
+        self.refresh_ready(shot);
+    }
+
+    /// Gives one worker another chance at a shot.
+    fn clear(&mut self, worker: WorkerId, shot: ShotId) {
+        let Some(known) = self.shots.get_mut(&shot) else { return };
+        known.faults.remove(&worker);
+        if known.blocked.remove(&worker) {
+            self.actions.push_back(Action::Unblocked { worker, shot });
+            self.unpark();
+        }
     }
 
     fn fire_timers(&mut self) {

@@ -80,6 +80,8 @@ pub(crate) struct Shot {
     pub(crate) frames: u32,
     /// Larger is more urgent.
     pub(crate) priority: i32,
+    /// Whether it waits until someone resumes it.
+    pub(crate) is_paused: bool,
     /// The most frames open or untaken.
     pub(crate) frames_in_flight: u32,
     /// The first frame not yet begun.
@@ -140,6 +142,7 @@ impl Shot {
             grid,
             frames,
             priority,
+            is_paused: false,
             frames_in_flight,
             next_frame: 0,
             open: BTreeMap::new(),
@@ -166,7 +169,8 @@ impl Shot {
 
     /// Whether there is anything to grant.
     pub(crate) fn has_work(&self) -> bool {
-        !self.waiting.is_empty() || self.cutting.is_some() || self.frames_to_open() > 0
+        let some = !self.waiting.is_empty() || self.cutting.is_some() || self.frames_to_open() > 0;
+        some && !self.is_paused
     }
 
     /// Whether every frame is complete or has failed.

@@ -60,6 +60,7 @@ impl Bench {
             split: Split::Columns,
             frames,
             frames_in_flight: 2,
+            priority: 0,
         };
         self.say(Peer::Client(CLIENT), submit);
         let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
@@ -283,6 +284,7 @@ fn a_shot_that_needs_too_much_memory_is_rejected_with_advice() {
         split: Split::Columns,
         frames: 1000,
         frames_in_flight: 1000,
+        priority: 0,
     };
     let out = bench.say(Peer::Client(CLIENT), submit);
     let [Out::Send(_, Message::Rejected(rejected))] = &out[..] else { panic!("{out:?}") };

@@ -40,6 +40,8 @@ pub enum Role {
     },
     /// Submits shots, supplies their terrain, takes their frames.
     Client,
+    /// Asks the coordinator's API: see [`super::desk`].
+    Desk,
 }
 
 impl Role {
@@ -48,6 +50,7 @@ impl Role {
         match self {
             Role::Worker { .. } => "worker",
             Role::Client => "client",
+            Role::Desk => "desk",
         }
     }
 }

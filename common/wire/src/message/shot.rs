@@ -47,6 +47,8 @@ pub struct Submit {
     pub frames: u32,
     /// How many frames may be begun and not yet taken, at most [`FRAMES_IN_FLIGHT_MAX`].
     pub frames_in_flight: u32,
+    /// Shots of a higher priority get every worker they can use; equals take turns.
+    pub priority: i32,
 }
 
 /// Twin of [`Submit`].
@@ -62,6 +64,7 @@ pub(crate) struct SubmitTwin {
     split: SplitTwin,
     frames: u32,
     frames_in_flight: u32,
+    priority: i32,
 }
 
 impl Body for Submit {
@@ -79,6 +82,7 @@ impl Body for Submit {
             split: self.split.into(),
             frames: self.frames,
             frames_in_flight: self.frames_in_flight,
+            priority: self.priority,
         }
     }
 
@@ -95,6 +99,7 @@ impl Body for Submit {
             split: wire.split.try_into()?,
             frames: wire.frames,
             frames_in_flight: wire.frames_in_flight,
+            priority: wire.priority,
         })
     }
 

@@ -150,6 +150,7 @@ pub fn all() -> Vec<(String, Message)> {
             split: Split::Tiles(128),
             frames: 600,
             frames_in_flight: 4,
+            priority: -3,
         }
         .into(),
         Cameras { number, first: frame, cameras: vec![camera(); 2] }.into(),
@@ -188,6 +189,23 @@ pub fn all() -> Vec<(String, Message)> {
         }
         .into(),
         ShotFailed { shot, reason: text() }.into(),
+        hello(Role::Desk).into(),
+        Request {
+            number,
+            verb: Verb::Put,
+            path: "/api/v1/shots/300/priority".into(),
+            range: Some((1 << 20, 4096)),
+            body: b"{\"priority\":5}"[..].into(),
+        }
+        .into(),
+        Response {
+            number,
+            status: 404,
+            content_type: "application/json".into(),
+            total: 2,
+            body: b"{}"[..].into(),
+        }
+        .into(),
     ];
     let mut seen = 0;
     let named = messages.into_iter().map(|message| {
@@ -306,6 +324,7 @@ pub fn any_message() -> impl Strategy<Value = Message> {
                 split: if side % 2 == 0 { Split::Columns } else { Split::Tiles(side) },
                 frames,
                 frames_in_flight: 1 + frames % 1024,
+                priority: frames as i32 - 1000,
             }
             .into()
         },

@@ -117,7 +117,13 @@ impl Judge {
                     shot.untaken.remove(frame);
                 }
             }
-            Event::ShotCanceled { .. } | Event::HeardFrom { .. } | Event::Tick => {}
+            Event::ShotCanceled { .. }
+            | Event::ShotPaused { .. }
+            | Event::ShotResumed { .. }
+            | Event::ShotPrioritised { .. }
+            | Event::WorkerCleared { .. }
+            | Event::HeardFrom { .. }
+            | Event::Tick => {}
         }
     }
 

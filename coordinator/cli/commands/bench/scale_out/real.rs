@@ -221,6 +221,7 @@ fn submission(store: &Arc<StoreReader>, cameras: Vec<Camera>, split: Split) -> S
         split,
         cameras,
         frames_in_flight: FRAMES_IN_FLIGHT,
+        priority: 0,
     }
 }
 

@@ -1,0 +1,159 @@
+//! What is shown of a farm: to the page, to scripts, to the command line.
+//!
+//! A view is a copy that hides nothing and promises nothing: the driver publishes a new one
+//! a few times a second. Its JSON is part of the API: keys are added, never renamed.
+
+use serde::{Deserialize, Serialize};
+use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
+
+/// Everything at one moment.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct FarmView {
+    /// When, milliseconds since the coordinator started.
+    pub at_ms: u64,
+    /// Who renders, by number.
+    pub workers: Vec<WorkerView>,
+    /// The shots under way, by number: not those that wait in the queue on disk.
+    pub shots: Vec<ShotView>,
+    /// Leases held now.
+    pub jobs_running: u64,
+    /// Jobs whose pixels were used, since the start.
+    pub jobs_done: u64,
+    /// Leases granted again because a worker was lost, failed or slow, since the start.
+    pub jobs_repeated: u64,
+    /// Results that came too late and were refused, since the start.
+    pub results_refused: u64,
+    /// Frames finished since the start.
+    pub frames_done: u64,
+    /// How well the farm was used, oldest first; at most [`HISTORY_MAX`].
+    pub history: Vec<Sample>,
+}
+
+/// Most samples of the history that are kept: an hour at one in five seconds.
+pub const HISTORY_MAX: usize = 720;
+
+/// How well the farm was used for a while.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Sample {
+    /// Its end, milliseconds since the coordinator started.
+    pub at_ms: u64,
+    /// Share of the workers' time that was spent on rendering what was used, 0 to 1.
+    pub efficiency: f64,
+    /// Frames finished per second.
+    pub frames_per_s: f64,
+    /// Workers connected at its end.
+    pub workers: u32,
+}
+
+/// What a worker does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WorkerState {
+    /// It holds no job.
+    Idle,
+    /// It holds jobs.
+    Busy,
+    /// It finishes what it has and leaves.
+    Draining,
+}
+
+/// One worker.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct WorkerView {
+    /// Number of its connection.
+    pub id: WorkerId,
+    /// What it calls itself.
+    pub name: String,
+    /// Render threads.
+    pub threads: u32,
+    /// What it does.
+    pub state: WorkerState,
+    /// Its speed, in threads of this farm's average worker.
+    pub speed: f64,
+    /// What it renders now: the first of the jobs it holds.
+    pub job: Option<JobView>,
+    /// Jobs it holds.
+    pub jobs_held: u32,
+    /// Jobs of it whose pixels were used.
+    pub jobs_done: u64,
+    /// Jobs that it failed at.
+    pub jobs_failed: u64,
+    /// Time since anything was heard of it, milliseconds.
+    pub heard_ms: u64,
+    /// Where its time went since it joined, shares of 1: rendering.
+    pub rendering: f64,
+    /// Share of its time in which a job waited for terrain.
+    pub terrain: f64,
+    /// Shots that it gets no more of, since it failed at them too often.
+    pub blocked: Vec<ShotId>,
+    /// Whether it is out of the farm, since its pixels differed from those of others.
+    pub distrusted: bool,
+}
+
+/// One job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobView {
+    /// The shot.
+    pub shot: ShotId,
+    /// The frame.
+    pub frame: FrameIndex,
+    /// Columns `x` to `x + width`, rows `y` to `y + height`, pixels.
+    pub region: [u32; 4],
+}
+
+/// Where a shot is on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ShotState {
+    /// It waits in the queue for its turn.
+    Waiting,
+    /// Frames of it are or may be rendered.
+    Running,
+    /// It waits until someone resumes it.
+    Paused,
+    /// It waits for something to be put right, such as a full disk; see `note`.
+    Stalled,
+    /// Its frames are being made into a film.
+    Finishing,
+    /// Every frame is complete or has failed.
+    Done,
+    /// It was given up; see `note`.
+    Failed,
+    /// Someone canceled it.
+    Canceled,
+}
+
+/// One shot.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ShotView {
+    /// Its number on this farm.
+    pub id: ShotId,
+    /// What it is called.
+    pub name: String,
+    /// Where it is on its way.
+    pub state: ShotState,
+    /// Why, where that needs saying.
+    pub note: String,
+    /// Larger is more urgent.
+    pub priority: i32,
+    /// Whether it is in the queue on disk; else it ends with the client that submitted it.
+    pub queued: bool,
+    /// Number of frames.
+    pub frames: u32,
+    /// Frames finished.
+    pub frames_done: u32,
+    /// Frames given up.
+    pub frames_failed: u32,
+    /// Width and height, pixels.
+    pub size: [u32; 2],
+    /// The method, by name.
+    pub method: String,
+    /// When it was submitted, seconds since 1970.
+    pub submitted_s: u64,
+    /// Frames finished per second, lately.
+    pub frames_per_s: f64,
+    /// How long it will take, seconds; `None` while nobody knows.
+    pub eta_s: Option<f64>,
+    /// The frame that was finished last, if any.
+    pub last_frame: Option<FrameIndex>,
+}
