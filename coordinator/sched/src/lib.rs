@@ -44,6 +44,7 @@ mod scheduler;
 mod shot;
 pub mod sim;
 mod split;
+mod why;
 mod worker;
 
 pub use config::{
@@ -53,3 +54,4 @@ pub use event::{
     Action, DropReason, Event, FrameFailure, LostReason, Micros, RefuseReason, ShotFailure,
 };
 pub use scheduler::{Account, Scheduler};
+pub use why::Why;
