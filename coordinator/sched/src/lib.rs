@@ -38,6 +38,7 @@ mod config;
 mod event;
 mod grant;
 mod lease;
+mod order;
 mod outcome;
 mod rng;
 mod scheduler;
@@ -53,5 +54,6 @@ pub use config::{
 pub use event::{
     Action, DropReason, Event, FrameFailure, LostReason, Micros, RefuseReason, ShotFailure,
 };
+pub use order::YIELD_US;
 pub use scheduler::{Account, Scheduler};
 pub use why::Why;

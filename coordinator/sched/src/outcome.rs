@@ -30,6 +30,8 @@ pub(crate) enum End {
     Lost,
     /// The worker has been blocked for its shot.
     Barred,
+    /// An order has made something else more urgent.
+    Preempted,
     /// Nobody wants the result any more: the job is not done again.
     Unwanted,
 }
@@ -216,10 +218,11 @@ impl Scheduler {
             End::Failed => &mut self.account.failed,
             End::Expired => &mut self.account.expired,
             End::Lost => &mut self.account.lost,
-            End::Barred | End::Unwanted => &mut self.account.revoked,
+            End::Barred | End::Preempted | End::Unwanted => &mut self.account.revoked,
         };
         *counter += 1;
-        if matches!(end, End::Expired | End::Barred | End::Unwanted) {
+        self.account.preempted += u64::from(end == End::Preempted);
+        if matches!(end, End::Expired | End::Barred | End::Preempted | End::Unwanted) {
             self.actions.push_back(Action::Revoke { worker: lease.worker, lease: id });
         }
         self.refresh_hunger(lease.worker);
@@ -255,6 +258,9 @@ impl Scheduler {
             if was_head {
                 if let Some(at) = worker.head_deadline.take() {
                     self.timers.remove(&(at, Timer::Head(lease.worker)));
+                }
+                if let Some(at) = worker.yields_at.take() {
+                    self.timers.remove(&(at, Timer::Yield(lease.worker)));
                 }
                 self.start_head(lease.worker);
             }

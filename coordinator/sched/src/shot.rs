@@ -169,8 +169,12 @@ impl Shot {
 
     /// Whether there is anything to grant.
     pub(crate) fn has_work(&self) -> bool {
-        let some = !self.waiting.is_empty() || self.cutting.is_some() || self.frames_to_open() > 0;
-        some && !self.is_paused
+        (!self.waiting.is_empty() || self.has_uncut()) && !self.is_paused
+    }
+
+    /// Whether there is anything that no job has been cut from.
+    pub(crate) fn has_uncut(&self) -> bool {
+        self.cutting.is_some() || self.frames_to_open() > 0
     }
 
     /// Whether every frame is complete or has failed.
