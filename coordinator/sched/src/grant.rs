@@ -47,7 +47,7 @@ impl Scheduler {
         let Some((shot, again)) = self.find(worker) else { return false };
         let Some((key, job)) = self.take(worker, shot, again) else { return false };
         self.grant(worker, shot, key, job);
-        self.take_turn(shot);
+        self.refresh_ready(shot);
         true
     }
 
@@ -97,21 +97,6 @@ impl Scheduler {
         }
     }
 
-    /// Puts a shot behind the others of its priority.
-    fn take_turn(&mut self, shot: ShotId) {
-        self.turn += 1;
-        if let Some(known) = self.shots.get_mut(&shot)
-            && let Some(key) = known.ready.take()
-        {
-            self.ready.remove(&key);
-            if known.has_work() {
-                let key = (key.0, self.turn, shot);
-                known.ready = Some(key);
-                self.ready.insert(key);
-            }
-        }
-    }
-
     /// Grants a job that is in no list of its shot, or is running there already.
     fn grant(&mut self, worker: WorkerId, shot: ShotId, key: JobKey, mut job: Job) {
         let (Some(known), Some(of)) = (self.workers.get(&worker), self.shots.get_mut(&shot)) else {
@@ -145,6 +130,7 @@ impl Scheduler {
                 self.start_head(worker);
             }
         }
+        self.charge(shot, cost);
         for lease in leases {
             self.refresh_hedgeable(lease);
         }

@@ -42,6 +42,7 @@ mod order;
 mod outcome;
 mod rng;
 mod scheduler;
+mod share;
 mod shot;
 pub mod sim;
 mod split;

@@ -36,17 +36,23 @@ impl Scheduler {
     /// Lets a shot go on.
     pub(crate) fn resume(&mut self, shot: ShotId) {
         let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.is_paused = false;
+        if known.is_paused {
+            known.is_paused = false;
+            self.catch_up(shot, 0.0);
+        }
         self.refresh_ready(shot);
     }
 
     /// Gives a shot another priority.
     pub(crate) fn prioritise(&mut self, shot: ShotId, priority: i32) {
         let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.priority = priority;
-        if let Some(key) = known.ready.take() {
-            self.ready.remove(&key);
+        if known.priority != priority {
+            known.priority = priority;
+            // Among its new equals it begins anew.
+            known.served = 0.0;
+            self.catch_up(shot, 0.0);
         }
+        self.unready(shot);
         self.refresh_ready(shot);
     }
 

@@ -1,7 +1,7 @@
 //! The state machine: its parts, and what workers and shots that come and go do to it.
 //!
 //! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `order.rs` obeys people,
-//! and `check.rs` states what always holds.
+//! `share.rs` keeps equals equal, and `check.rs` states what always holds.
 
 use crate::config::{Config, MAX_SHOTS, MAX_WORKERS};
 use crate::event::{Action, DropReason, Event, Micros, ShotFailure};
@@ -74,8 +74,6 @@ pub struct Scheduler {
     pub(crate) active: usize,
     pub(crate) active_threads: u64,
     pub(crate) active_speed: f64,
-    /// Counts grants, so that shots of one priority take turns.
-    pub(crate) turn: u64,
 }
 
 impl Scheduler {
@@ -99,7 +97,6 @@ impl Scheduler {
             active: 0,
             active_threads: 0,
             active_speed: 0.0,
-            turn: 0,
         }
     }
 
@@ -286,6 +283,7 @@ impl Scheduler {
         match made {
             Ok(made) => {
                 self.shots.insert(shot, made);
+                self.catch_up(shot, 0.0);
                 self.refresh_ready(shot);
             }
             Err(reason) => self.actions.push_back(Action::ShotFailed { shot, reason }),
@@ -344,24 +342,6 @@ impl Scheduler {
         let next_at = next_at.max(self.now.after(1));
         if next_at > self.now {
             self.timers.insert((next_at, Timer::Beat(worker)));
-        }
-    }
-
-    /// Brings a shot's place among the ready ones up to date.
-    pub(crate) fn refresh_ready(&mut self, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        match (known.ready, known.has_work()) {
-            (None, true) => {
-                let key = (std::cmp::Reverse(known.priority), self.turn, shot);
-                known.ready = Some(key);
-                self.ready.insert(key);
-                self.unpark();
-            }
-            (Some(key), false) => {
-                known.ready = None;
-                self.ready.remove(&key);
-            }
-            _ => {}
         }
     }
 

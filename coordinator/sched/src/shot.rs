@@ -15,7 +15,7 @@ use terrafarm_common::region::Split;
 /// A job's place: frame and first atom. No two jobs share one, since they do not overlap.
 pub(crate) type JobKey = (FrameIndex, u32);
 
-/// Which shot is served next: highest priority, then the one whose turn is longest ago.
+/// Which shot is served next: highest priority, then the one that was served least.
 pub(crate) type ReadyKey = (Reverse<i32>, u64, ShotId);
 
 /// A job that has been cut and is not done.
@@ -82,6 +82,8 @@ pub(crate) struct Shot {
     pub(crate) priority: i32,
     /// Whether it waits until someone resumes it.
     pub(crate) is_paused: bool,
+    /// Work charged to it, cost units; only differences between equals mean anything.
+    pub(crate) served: f64,
     /// The most frames open or untaken.
     pub(crate) frames_in_flight: u32,
     /// The first frame not yet begun.
@@ -143,6 +145,7 @@ impl Shot {
             frames,
             priority,
             is_paused: false,
+            served: 0.0,
             frames_in_flight,
             next_frame: 0,
             open: BTreeMap::new(),

@@ -434,6 +434,30 @@ fn a_full_queue_of_endless_shots_costs_nothing_before_they_begin() {
 }
 
 #[test]
+fn a_shot_that_cannot_go_on_does_not_stop_its_equals() {
+    let mut farm = Farm::new();
+    farm.join(1, 1);
+    farm.join(2, 1);
+    // Of one, frames are never taken; of the other, worker 1 fails at everything.
+    farm.submit_split(1, 100, 0, 1, Split::Tiles(640));
+    farm.submit_split(2, 100, 0, 200, Split::Tiles(640));
+    farm.submit_split(3, 100, 0, 200, Split::Tiles(640));
+    let mut accepted = [0; 4];
+    for _ in 0..100 {
+        let Some(job) = farm.grants.pop_front() else { break };
+        farm.now += 5;
+        if job.shot == ShotId(2) && job.worker == WorkerId(1) {
+            farm.fail(job);
+        } else {
+            farm.done(job, 5);
+            accepted[job.shot.0 as usize] += 1;
+        }
+    }
+    assert_eq!(accepted[1], 1, "its only frame in flight");
+    assert!(accepted[2] > 30 && accepted[3] > 30, "{accepted:?}");
+}
+
+#[test]
 fn a_frame_that_is_not_done_has_a_reason() {
     let mut farm = Farm::new();
     let (shot, other) = (ShotId(1), ShotId(2));
