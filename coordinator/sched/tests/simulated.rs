@@ -47,6 +47,8 @@ fn bad_night(seed: u64, deadly: bool) -> SimConfig {
         workers: 1 + spread(12) as u32,
         seed,
         shots: 1 + spread(3) as u32,
+        arrive_within_s: spread(2) as f64 * 10.0,
+        frame_skew: spread(3) as f64 * 4.0,
         frames: 1 + spread(17) as u32,
         width: 100 + spread(97) as u32,
         height: 64,
