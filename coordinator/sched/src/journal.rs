@@ -21,6 +21,8 @@
 mod record;
 mod recorder;
 mod replay;
+#[cfg(test)]
+mod tests;
 
 pub use recorder::{Recorder, Stopped};
 pub use replay::{Difference, ReplayError, ReplayReport, Torn, replay};

@@ -69,7 +69,7 @@ impl Chain {
     }
 }
 
-fn check_of_length(length: usize, number: u64) -> [u8; 2] {
+pub(super) fn check_of_length(length: usize, number: u64) -> [u8; 2] {
     let hash = xxh3_64_with_seed(&(length as u64).to_le_bytes(), number);
     (hash as u16).to_le_bytes()
 }

@@ -119,9 +119,9 @@ impl<W: Write> Recorder<W> {
         self.mark().and_then(|()| self.write_out()).map_err(|why| self.end(why))
     }
 
-    /// Bytes of the journal so far.
-    pub fn bytes(&self) -> u64 {
-        self.bytes
+    /// Gives back where it wrote to. What is gathered and not written is lost.
+    pub fn into_inner(self) -> W {
+        self.out
     }
 
     fn note(&mut self, now: Micros, event: &Event) -> Result<(), Stopped> {
