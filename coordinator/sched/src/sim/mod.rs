@@ -25,6 +25,12 @@ use serde::Serialize;
 use std::io::Write;
 use terrafarm_common::region::Split;
 
+/// Mean speed of workers between the default bounds.
+const MEAN_SPEED: f64 = 1.68;
+/// Work of the whole farm that is in flight, seconds. Frames are stored in their order: if
+/// a worker dies, the others can go on for so long until a copy of its job is done.
+const AHEAD_S: f64 = 1.2;
+
 /// What is simulated.
 #[derive(Debug, Clone)]
 pub struct SimConfig {
@@ -106,13 +112,14 @@ impl SimConfig {
     pub fn for_workers(workers: u32, seed: u64) -> Self {
         let base = SimConfig::default();
         let frame_work_s = base.frame_work_s.max(f64::from(workers) / 50.0);
-        let speed = 1.68 * f64::from(workers.max(1));
+        let speed = MEAN_SPEED * f64::from(workers.max(1));
+        let ahead = (AHEAD_S * speed / frame_work_s).ceil() as u32;
         SimConfig {
             workers,
             seed,
             frames: (60.0 * speed / frame_work_s).ceil() as u32,
             frame_work_s,
-            frames_in_flight: base.frames_in_flight.max(workers / 10),
+            frames_in_flight: base.frames_in_flight.max(workers / 10).max(ahead),
             ..base
         }
     }
