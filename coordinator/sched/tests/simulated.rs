@@ -207,8 +207,9 @@ fn workers_that_come_and_go_all_night_are_used_while_they_are_there() {
     let faults = Faults { stay_s: 15.0, come_back: true, ..Faults::default() };
     let report = run(&SimConfig { faults, ..SimConfig::for_workers(100, 8) });
     assert!(report.account.lost > 50 && report.account.handed_back > 50, "{report:?}");
-    // Measured: 0.882, with a machine that loses power every half second.
-    assert!(report.efficiency >= 0.85, "{report:?}");
+    // Measured: 0.815. Every 0.7 s a machine loses power with jobs of the oldest frames, and
+    // copies of them are made only when somebody has run out of work.
+    assert!(report.efficiency >= 0.78, "{report:?}");
 }
 
 #[test]

@@ -101,9 +101,15 @@ impl Tally {
 
     /// The scheduler has given a worker up.
     pub(crate) fn dropped(&mut self, now_us: u64, worker: WorkerId) {
-        let since_us = self.silent_since.remove(&worker);
-        self.notices_us.extend(since_us.map(|since| now_us - since));
-        self.dropped.insert(worker);
+        let since_us = self.silent_since(worker);
+        if self.dropped.insert(worker) {
+            self.notices_us.extend(since_us.map(|since| now_us - since));
+        }
+    }
+
+    /// When a connection went silent for good, if it did.
+    pub(crate) fn silent_since(&self, worker: WorkerId) -> Option<u64> {
+        self.silent_since.get(&worker).copied()
     }
 
     /// A result was refused.

@@ -202,11 +202,12 @@ impl World<'_> {
     fn send_up(&mut self, i: usize, event: Event, bytes: f64, is_certain: bool) {
         let copies = if is_certain { 1 } else { self.copies() };
         let machine = &mut self.machines[i];
+        let Some(sender) = machine.connection else { return };
         machine.sent_at_us =
             machine.sent_at_us.max(self.now_us) + (bytes / machine.bytes_per_us) as u64;
         let at = (machine.sent_at_us + machine.latency_us).max(machine.cut_until_us);
         for _ in 0..copies {
-            self.later(at, Happening::AtHub(event.clone(), bytes));
+            self.later(at, Happening::AtHub(sender, event.clone(), bytes));
         }
     }
 

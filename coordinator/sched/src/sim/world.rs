@@ -30,7 +30,7 @@ pub(super) enum Happening {
     /// A rendering ends, if it is still the one with this serial number.
     Finish(usize, u64),
     /// A message has reached the coordinator's link.
-    AtHub(Event, f64),
+    AtHub(WorkerId, Event, f64),
     /// A message has reached the coordinator.
     Arrive(Event),
     /// A message has reached a worker, over this connection.
@@ -213,7 +213,10 @@ impl<'a> World<'a> {
             Happening::Fault(i, fault) => self.go_wrong(i, fault),
             Happening::Depart(i, connection) => self.depart(i, connection),
             Happening::Finish(i, serial) => self.finish(i, serial),
-            Happening::AtHub(event, bytes) => {
+            Happening::AtHub(sender, event, bytes) => {
+                if self.died_with_it(sender) {
+                    return;
+                }
                 let begins = self.hub_free_at_us.max(self.now_us);
                 self.hub_free_at_us = begins + (bytes / self.config.hub_bytes_per_us) as u64;
                 self.later(self.hub_free_at_us, Happening::Arrive(event));
@@ -222,6 +225,12 @@ impl<'a> World<'a> {
             Happening::Deliver(i, connection, action) => self.deliver(i, connection, action),
             Happening::Stored(shot, frame) => self.tell(Event::FrameTaken { shot, frame }),
         }
+    }
+
+    /// Whether a message that arrives now was still at its sender when that lost power.
+    fn died_with_it(&self, sender: WorkerId) -> bool {
+        let latency_us = self.connections.get(&sender).map_or(0, |&i| self.machines[i].latency_us);
+        self.tally.silent_since(sender).is_some_and(|since| self.now_us > since + latency_us)
     }
 
     /// Tells the scheduler, and does what it asks for.
