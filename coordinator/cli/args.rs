@@ -378,20 +378,57 @@ pub struct Compare {
 #[derive(Debug, ClapArgs)]
 pub struct Simulate {
     /// Workers
-    #[arg(long, default_value_t = 31, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, default_value_t = 31, value_parser = parse_simulated_workers)]
     pub workers: u32,
-    /// Frames of the shot [default: about a minute of work]
+    /// Frames of all shots together [default: about a minute of work]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
+    /// Shots that share the frames, of three priorities; all but the first arrive within the
+    /// first half minute
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub shots: u32,
     /// Same seed, same run
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Let workers die, fall silent, come back late and lose messages
+    /// Everything below goes wrong, and workers hang, get stuck, fail at jobs and hand them
+    /// back
     #[arg(long)]
     pub faults: bool,
+    /// Workers leave, crash or lose power, and come back, all the time
+    #[arg(long)]
+    pub churn: bool,
+    /// Links and whole switches carry nothing for a while; what workers render meanwhile
+    /// comes too late
+    #[arg(long)]
+    pub partitions: bool,
+    /// A third of the links are wireless, or come from homes
+    #[arg(long)]
+    pub slow_links: bool,
+    /// Messages are lost, or come twice
+    #[arg(long)]
+    pub lost_messages: bool,
+    /// Some columns cost sixteen times as much as others, and some frames ten times
+    #[arg(long)]
+    pub skew: bool,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Keep a journal of all that the scheduler is told, to be replayed
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
+    /// Instead of making a night up, play a journal again; exit code 1 if the scheduler does
+    /// not ask for the same
+    #[arg(long, value_name = "FILE", conflicts_with_all = [
+        "workers", "frames", "shots", "seed", "faults", "churn", "partitions", "slow_links",
+        "lost_messages", "skew", "journal",
+    ])]
+    pub replay: Option<PathBuf>,
+}
+
+fn parse_simulated_workers(text: &str) -> Result<u32, String> {
+    let most = terrafarm_sched::MAX_WORKERS as u32;
+    let workers = text.parse().ok().filter(|workers| (1..=most).contains(workers));
+    workers.ok_or_else(|| format!("choose 1 to {most}: a farm has no room for more"))
 }
 
 /// `terrafarm bench ...`

@@ -1,10 +1,13 @@
 //! What can happen, and what the scheduler may ask for.
 
+use serde::{Deserialize, Serialize};
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::{Region, Split};
 
 /// A time: microseconds since any fixed moment, the same for all events of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize,
+)]
 pub struct Micros(pub u64);
 
 impl Micros {
@@ -22,7 +25,7 @@ impl Micros {
 
 /// Something that happened. Events about a worker or a shot that is not known, or no
 /// longer, change nothing; a result from one is refused.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Event {
     /// When a worker has finished its handshake. A second join of the same worker
     /// changes nothing.
@@ -139,7 +142,7 @@ pub enum Event {
 }
 
 /// Something to be done, in the order given.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub enum Action {
     /// Send a job. A worker runs its jobs in the order of their grants.
     Grant {
@@ -244,7 +247,7 @@ pub enum Action {
 }
 
 /// How a connection ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LostReason {
     /// The worker said that it leaves.
     Left,
@@ -255,7 +258,7 @@ pub enum LostReason {
 }
 
 /// Why pixels are thrown away. All three are part of normal work.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum RefuseReason {
     /// The lease has ended: it expired, or the job was revoked or granted to another.
     Stale,
@@ -266,7 +269,7 @@ pub enum RefuseReason {
 }
 
 /// Why a worker is dropped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum DropReason {
     /// When no byte came for [`crate::Config::silence_us`].
     #[error("silent for {silence_us} us, probes unanswered; is the machine asleep or unplugged?")]
@@ -283,7 +286,7 @@ pub enum DropReason {
 }
 
 /// Why a frame failed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum FrameFailure {
     /// When one of its jobs failed too often.
     #[error("{} x {} pixels at ({}, {}) failed {tries} times, at last on {worker}: {reason}",
@@ -301,7 +304,7 @@ pub enum FrameFailure {
 }
 
 /// Why a shot failed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum ShotFailure {
     /// When [`crate::MAX_SHOTS`] are queued.
     #[error(

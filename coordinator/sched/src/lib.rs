@@ -37,6 +37,7 @@ mod check;
 mod config;
 mod event;
 mod grant;
+pub mod journal;
 mod lease;
 mod order;
 mod outcome;
