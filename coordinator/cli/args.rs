@@ -359,7 +359,7 @@ pub struct Worker {
     pub memory_limit: u64,
     /// When to work, by this PC's clock: days, times or both, such as
     /// "mon-fri 18:00-08:00, sat, sun" [default: always]
-    #[arg(long, value_name = "HOURS")]
+    #[arg(long, value_name = "HOURS", env = "TERRAFARM_HOURS")]
     pub hours: Option<Hours>,
     /// Make room: one thread while the PC's user is there, none on cores that other
     /// programs use
