@@ -7,6 +7,10 @@ use std::path::PathBuf;
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
+use terrafarm_worker::office::hours::Hours;
+
+/// Where a coordinator listens, and is looked for, unless something else is said.
+pub const COORDINATOR: &str = "127.0.0.1:7070";
 
 /// Flies a camera over real terrain, rendered by every PC in the office.
 #[derive(Debug, Parser)]
@@ -315,8 +319,11 @@ pub enum Encoder {
 #[derive(Debug, ClapArgs)]
 pub struct Coordinator {
     /// Address to listen on
-    #[arg(long, default_value = "127.0.0.1:7070")]
+    #[arg(long, default_value = COORDINATOR)]
     pub listen: SocketAddr,
+    /// Do not let workers on the local network find this coordinator (multicast DNS)
+    #[arg(long)]
+    pub no_announce: bool,
     /// How links are secured
     #[command(flatten)]
     pub security: Security,
@@ -328,14 +335,10 @@ pub struct Coordinator {
 /// `terrafarm worker`
 #[derive(Debug, ClapArgs)]
 pub struct Worker {
-    /// The coordinator to work for
-    #[arg(
-        long,
-        value_name = "HOST:PORT",
-        env = "TERRAFARM_COORDINATOR",
-        default_value = "127.0.0.1:7070"
-    )]
-    pub coordinator: String,
+    /// The coordinator to work for [default: the one on this PC, else the one that answers
+    /// on this network]
+    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
+    pub coordinator: Option<String>,
     /// How the link is secured
     #[command(flatten)]
     pub security: Security,
@@ -354,6 +357,17 @@ pub struct Worker {
     /// Memory for decoded tiles, MiB
     #[arg(long, default_value_t = 1024, value_parser = clap::value_parser!(u64).range(64..=1_048_576))]
     pub memory_limit: u64,
+    /// When to work, by this PC's clock: days, times or both, such as
+    /// "mon-fri 18:00-08:00, sat, sun" [default: always]
+    #[arg(long, value_name = "HOURS", env = "TERRAFARM_HOURS")]
+    pub hours: Option<Hours>,
+    /// Make room: one thread while the PC's user is there, none on cores that other
+    /// programs use
+    #[arg(long)]
+    pub polite: bool,
+    /// Most to send and most to receive, megabits per second each [default: no limit]
+    #[arg(long, value_name = "MBIT", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub bandwidth: Option<u64>,
     /// End when the coordinator goes away instead of waiting for it
     #[arg(long)]
     pub once: bool,
