@@ -19,7 +19,9 @@ use terrafarm_common::image::Rgb8;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
-use terrafarm_coordinator::client::{self, ClientError, FrameFacts, Submission, Update};
+use terrafarm_coordinator::client::{
+    self, ClientError, Coordinator, FrameFacts, Submission, Update,
+};
 use terrafarm_coordinator::sink::manifest::{FrameEntry, Manifest, WorkerEntry};
 use terrafarm_coordinator::sink::{self, Encoder, Finished, FrameSink, Spec};
 use terrafarm_film::OrderedFrames;
@@ -33,6 +35,8 @@ use tokio_util::sync::CancellationToken;
 pub const FRAMES_IN_FLIGHT: u32 = 3;
 /// How long nothing may come back before the user is told why that may be.
 const PATIENCE: Duration = Duration::from_secs(8);
+/// How long a coordinator that went away is waited for: a PC that restarts takes minutes.
+const COORDINATOR_PATIENCE: Duration = Duration::from_secs(15 * 60);
 /// Shown instead of a frame that could not be rendered: nobody takes it for terrain.
 const FAILED_FRAME_RGB: [u8; 3] = [255, 0, 255];
 
@@ -202,9 +206,12 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         Farm::Local(crew) => Some(LocalFarm::start(*crew).await?),
         Farm::Remote(..) => None,
     };
-    let (address, trust) = match (&plan.farm, &farm) {
-        (Farm::Remote(address, trust), _) => (address.clone(), trust.clone()),
-        (Farm::Local(_), Some(farm)) => (farm.address.to_string(), Trust::Loopback),
+    let coordinator = match (&plan.farm, &farm) {
+        (Farm::Remote(address, trust), _) => {
+            let (address, trust) = (address.clone(), trust.clone());
+            Coordinator { address, trust, patience: COORDINATOR_PATIENCE }
+        }
+        (Farm::Local(_), Some(farm)) => Coordinator::local(farm.address),
         (Farm::Local(_), None) => unreachable!("a local farm was started above"),
     };
     let stop = CancellationToken::new();
@@ -232,7 +239,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         worst_p99_px: None,
         samples: u64::from(camera.width) * u64::from(camera.height) * samples_per_pixel,
     };
-    let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), address.clone()));
+    let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), coordinator.address.clone()));
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
     let submission = Submission {
         name: plan.name.clone(),
@@ -253,7 +260,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
             stop.cancel();
         }
     });
-    let rendered = client::render(&address, &trust, submission, updates, taken_out, stop).await;
+    let rendered = client::render(&coordinator, submission, updates, taken_out, stop).await;
     interrupt.abort();
     give_up.abort();
     hint.abort();
@@ -375,11 +382,19 @@ impl Desk {
     ) -> anyhow::Result<Written> {
         let mut order = OrderedFrames::new(self.spec.frames as usize);
         let mut written = Written::default();
+        let mut lost = false;
         while let Some(update) = inbox.blocking_recv() {
-            if let Some(first_sign) = self.first_sign.take() {
+            let is_lost = matches!(update, Update::Lost(_));
+            let was_lost = std::mem::replace(&mut lost, is_lost);
+            if let Some(first_sign) = self.first_sign.take_if(|_| !is_lost) {
                 let _ = first_sign.send(());
             }
             match update {
+                // Once for each time, however often it is tried.
+                Update::Lost(why) if !was_lost => {
+                    self.bar.suspend(|| eprintln!("terrafarm: {why}; trying again"));
+                }
+                Update::Lost(_) => {}
                 Update::Progress(progress) => {
                     self.workers = progress.workers;
                     self.say(&written);

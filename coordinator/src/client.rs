@@ -1,8 +1,11 @@
 //! The side that submits: sends a shot, supplies its terrain by hash, takes its frames.
+//!
+//! A coordinator that goes away is waited for: what has come is kept, what is missing is
+//! submitted again.
 
 use bytes::Bytes;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
@@ -12,10 +15,10 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
-use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox, Trust};
+use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Outbox, Trust};
 use terrafarm_wire::message::{
     Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
-    Progress, Role, ShotDone, Submit, WantBlobs,
+    Progress, Role, ShotDone, Submit, WantBlobs, Welcome,
 };
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
@@ -29,6 +32,11 @@ const URGENT_QUEUE: usize = 256;
 const BULK_QUEUE: usize = 16;
 /// Questions for blobs that may wait; further ones wait in the socket.
 const WANTS_QUEUE: usize = 64;
+/// The first pause before a lost coordinator is tried again; each further one is twice as
+/// long ...
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+/// ... up to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 /// The number of the only shot on a connection.
 const NUMBER: u32 = 1;
 
@@ -63,6 +71,8 @@ pub enum Update {
     FrameFailed(FrameIndex, String),
     /// How far it is.
     Progress(Progress),
+    /// The coordinator was lost, for this reason, and is tried again.
+    Lost(String),
 }
 
 /// What a frame took.
@@ -105,7 +115,7 @@ pub enum ClientError {
         source: HandshakeError,
     },
     /// The connection was lost.
-    #[error("the coordinator was lost: {0}; frames that were written are kept")]
+    #[error("the coordinator was lost: {0}; frames that have come are kept")]
     Link(#[from] LinkError),
     /// The farm does not take the shot, or gave it up.
     #[error("the farm refused the shot: {0}")]
@@ -115,90 +125,239 @@ pub enum ClientError {
     Stopped,
 }
 
-/// Submits a shot over a link that `trust` allows, and carries it to its end. Frames arrive in any order on `updates`; each
-/// has to be answered on `taken`, else no further ones come.
+/// Where a coordinator is, and how it is known.
+#[derive(Debug, Clone)]
+pub struct Coordinator {
+    /// `host:port`.
+    pub address: String,
+    /// Which links are trusted.
+    pub trust: Trust,
+    /// How long a coordinator that was lost is waited for; one that never answered is not.
+    pub patience: Duration,
+}
+
+impl Coordinator {
+    /// One on this PC that nobody restarts.
+    pub fn local(address: impl ToString) -> Self {
+        let address = address.to_string();
+        Coordinator { address, trust: Trust::Loopback, patience: Duration::ZERO }
+    }
+}
+
+/// Submits a shot and carries it to its end. Frames arrive in any order on `updates`, each
+/// once; each has to be answered on `taken`, else no further ones come. A coordinator that
+/// is lost is tried again, and gets what is still missing.
 ///
 /// # Errors
-/// If there is no coordinator, it refuses, it is lost, or `stop` is cancelled.
+/// If there is no coordinator, it refuses, it stays away for longer than is waited, or
+/// `stop` is cancelled.
 pub async fn render(
-    address: &str,
-    trust: &Trust,
+    coordinator: &Coordinator,
     submission: Submission,
     updates: mpsc::Sender<Update>,
     mut taken: mpsc::Receiver<FrameIndex>,
     stop: CancellationToken,
 ) -> Result<ShotDone, ClientError> {
+    let began = Instant::now();
+    let mut errand = Errand {
+        missing: (0..submission.cameras.len() as FrameIndex).collect(),
+        frames_done: 0,
+        frames_failed: 0,
+        was_accepted: false,
+        submission,
+    };
+    let mut lost_at = None;
+    let mut pause = FIRST_PAUSE;
+    loop {
+        errand.was_accepted = false;
+        let attempt = errand.attempt(coordinator, &updates, &mut taken, &stop);
+        let why = match attempt.await {
+            Ok(done) => {
+                let (frames_done, frames_failed) = (errand.frames_done, errand.frames_failed);
+                let elapsed_us = began.elapsed().as_micros() as u64;
+                return Ok(ShotDone { frames_done, frames_failed, elapsed_us, ..done });
+            }
+            Err(why) => why,
+        };
+        if errand.was_accepted {
+            (lost_at, pause) = (Some(Instant::now()), FIRST_PAUSE);
+        }
+        match lost_at {
+            Some(at) if why.may_pass() && at.elapsed() < coordinator.patience => {}
+            _ => return Err(why),
+        }
+        if updates.send(Update::Lost(why.to_string())).await.is_err() {
+            return Err(ClientError::Stopped);
+        }
+        tokio::select! {
+            () = tokio::time::sleep(pause) => {}
+            () = stop.cancelled() => return Err(ClientError::Stopped),
+        }
+        pause = (2 * pause).min(LONGEST_PAUSE);
+    }
+}
+
+impl ClientError {
+    /// Whether the coordinator may take the shot when it is tried again.
+    fn may_pass(&self) -> bool {
+        match self {
+            ClientError::Connect { .. } | ClientError::Link(_) => true,
+            ClientError::Handshake { source, .. } => match source {
+                HandshakeError::Refused { refusal, .. } | HandshakeError::TurnedAway(refusal) => {
+                    refusal.is_temporary()
+                }
+                // Somebody answered, but died at it; a token that was right stays right.
+                _ => true,
+            },
+            ClientError::Refused(_) | ClientError::Stopped => false,
+        }
+    }
+}
+
+/// A shot, and how much of it has come.
+struct Errand {
+    submission: Submission,
+    /// Frames that have not come, in order: those that the next coordinator is asked for.
+    missing: Vec<FrameIndex>,
+    frames_done: u32,
+    frames_failed: u32,
+    /// Whether the last coordinator took the shot.
+    was_accepted: bool,
+}
+
+impl Errand {
+    /// One connection, from the greeting to the last frame.
+    async fn attempt(
+        &mut self,
+        coordinator: &Coordinator,
+        updates: &mpsc::Sender<Update>,
+        taken: &mut mpsc::Receiver<FrameIndex>,
+        stop: &CancellationToken,
+    ) -> Result<ShotDone, ClientError> {
+        let (connection, welcome) = tokio::select! {
+            greeted = greet(coordinator, &self.submission.name) => greeted?,
+            () = stop.cancelled() => return Err(ClientError::Stopped),
+        };
+        let silence = Duration::from_micros(welcome.silence_us);
+        let (mut reader, writer) = connection.split();
+        let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
+        let writing = tokio::spawn(writer.run(queues));
+        let (wants, wanted) = mpsc::channel(WANTS_QUEUE);
+        let store = self.submission.store.clone();
+        let serving = tokio::spawn(serve_blobs(store, wanted, outbox.clone()));
+        // What this coordinator numbers from 0 on.
+        let asked = self.missing.clone();
+        let plan = self.submission.plan(&asked);
+        let submitting = tokio::spawn(send_submission(plan, outbox.clone()));
+
+        let mut talk = Talk::new(&self.submission, asked.len());
+        let mut heartbeat = tokio::time::interval(Duration::from_micros(welcome.heartbeat_us));
+        let result = loop {
+            if let Some(done) = talk.finished() {
+                break Ok(done);
+            }
+            self.was_accepted |= talk.id.is_some();
+            tokio::select! {
+                () = stop.cancelled() => {
+                    if let Some(shot) = talk.id {
+                        let _ = outbox.send(Cancel { shot }).await;
+                    }
+                    break Err(ClientError::Stopped);
+                }
+                Some(frame) = taken.recv() => {
+                    // One from before the coordinator was lost is no news to this one.
+                    if let (Some(shot), Ok(index)) = (talk.id, asked.binary_search(&frame)) {
+                        let taken = FrameTaken { shot, frame: index as FrameIndex };
+                        if let Err(why) = outbox.send(taken).await {
+                            break Err(why.into());
+                        }
+                    }
+                }
+                _ = heartbeat.tick() => if let Err(why) = outbox.send(Ping { number: 0 }).await {
+                    break Err(why.into());
+                },
+                received = reader.recv_within(silence) => match received {
+                    Ok(Some(Message::WantBlobs(want))) => {
+                        let _ = wants.send(want).await;
+                    }
+                    Ok(Some(Message::Ping(ping))) => {
+                        if let Err(why) = outbox.send(Pong { number: ping.number }).await {
+                            break Err(why.into());
+                        }
+                    }
+                    Ok(Some(message)) => match talk.hear(message).map(|said| self.note(said, &asked)) {
+                        Ok(Some(update)) => {
+                            // The receiver ends first only when writing failed.
+                            if updates.send(update).await.is_err() {
+                                break Err(ClientError::Stopped);
+                            }
+                        }
+                        Ok(None) => {}
+                        Err(why) => break Err(why),
+                    },
+                    Ok(None) => break Err(LinkError::Closed.into()),
+                    Err(why) => break Err(why.into()),
+                },
+            }
+        };
+        let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
+        submitting.abort();
+        serving.abort();
+        drop(outbox);
+        let _ = tokio::time::timeout(GREETING_LIMIT, writing).await;
+        result
+    }
+
+    /// Notes what has come; a frame that nobody waits for is dropped.
+    fn note(&mut self, update: Option<Update>, asked: &[FrameIndex]) -> Option<Update> {
+        let mut take = |index: FrameIndex| {
+            let frame = *asked.get(index as usize)?;
+            let at = self.missing.binary_search(&frame).ok()?;
+            self.missing.remove(at);
+            Some(frame)
+        };
+        match update? {
+            Update::Frame(index, picture, facts) => {
+                let frame = take(index)?;
+                self.frames_done += 1;
+                Some(Update::Frame(frame, picture, facts))
+            }
+            Update::FrameFailed(index, reason) => {
+                let frame = take(index)?;
+                self.frames_failed += 1;
+                Some(Update::FrameFailed(frame, reason))
+            }
+            Update::Progress(mut progress) => {
+                let before = self.submission.cameras.len() - asked.len();
+                progress.frames_done = progress.frames_done.saturating_add(before as u32);
+                Some(Update::Progress(progress))
+            }
+            other => Some(other),
+        }
+    }
+}
+
+/// Connects, and greets over a link that is trusted.
+async fn greet(
+    coordinator: &Coordinator,
+    name: &str,
+) -> Result<(Connection<TcpStream>, Welcome), ClientError> {
+    let address = &coordinator.address;
     let connect = tokio::time::timeout(GREETING_LIMIT, TcpStream::connect(address));
     let stream = match connect.await {
         Ok(Ok(stream)) => stream,
-        Ok(Err(source)) => return Err(ClientError::Connect { address: address.into(), source }),
+        Ok(Err(source)) => return Err(ClientError::Connect { address: address.clone(), source }),
         Err(_) => {
             let source = std::io::Error::from(std::io::ErrorKind::TimedOut);
-            return Err(ClientError::Connect { address: address.into(), source });
+            return Err(ClientError::Connect { address: address.clone(), source });
         }
     };
     let _ = stream.set_nodelay(true);
-    let hello = Hello::new(&submission.name, Role::Client);
-    let refused = |source| ClientError::Handshake { address: address.into(), source };
+    let hello = Hello::new(name, Role::Client);
+    let refused = |source| ClientError::Handshake { address: address.clone(), source };
     let peer = stream.peer_addr().map_err(|error| refused(LinkError::Io(error).into()))?;
-    let token = trust.token_for(peer.ip()).map_err(refused)?;
-    let (connection, welcome) =
-        link::greet(stream, token, hello, GREETING_LIMIT).await.map_err(refused)?;
-    let silence = Duration::from_micros(welcome.silence_us);
-    let (mut reader, writer) = connection.split();
-    let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
-    let writing = tokio::spawn(writer.run(queues));
-    let (wants, wanted) = mpsc::channel(WANTS_QUEUE);
-    let serving = tokio::spawn(serve_blobs(submission.store.clone(), wanted, outbox.clone()));
-    let submitting = tokio::spawn(send_submission(submission.clone_plan(), outbox.clone()));
-
-    let mut shot = Talk::new(&submission);
-    let mut heartbeat = tokio::time::interval(Duration::from_micros(welcome.heartbeat_us));
-    let result = loop {
-        if let Some(done) = shot.finished() {
-            break Ok(done);
-        }
-        tokio::select! {
-            () = stop.cancelled() => {
-                if let Some(shot) = shot.id {
-                    let _ = outbox.send(Cancel { shot }).await;
-                }
-                break Err(ClientError::Stopped);
-            }
-            Some(frame) = taken.recv() => {
-                if let Some(shot) = shot.id {
-                    outbox.send(FrameTaken { shot, frame }).await?;
-                }
-            }
-            _ = heartbeat.tick() => outbox.send(Ping { number: 0 }).await?,
-            received = reader.recv_within(silence) => match received {
-                Ok(Some(Message::WantBlobs(want))) => {
-                    let _ = wants.send(want).await;
-                }
-                Ok(Some(Message::Ping(ping))) => {
-                    outbox.send(Pong { number: ping.number }).await?;
-                }
-                Ok(Some(message)) => match shot.hear(message) {
-                    Ok(Some(update)) => {
-                        // The receiver ends first only when writing failed.
-                        if updates.send(update).await.is_err() {
-                            break Err(ClientError::Stopped);
-                        }
-                    }
-                    Ok(None) => {}
-                    Err(why) => break Err(why),
-                },
-                Ok(None) => break Err(LinkError::Closed.into()),
-                Err(why) => break Err(why.into()),
-            },
-        }
-    };
-    let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
-    submitting.abort();
-    serving.abort();
-    drop(outbox);
-    let _ = tokio::time::timeout(GREETING_LIMIT, writing).await;
-    result
+    let token = coordinator.trust.token_for(peer.ip()).map_err(refused)?;
+    link::greet(stream, token, hello, GREETING_LIMIT).await.map_err(refused)
 }
 
 /// What is known of the shot on this side.
@@ -211,10 +370,10 @@ struct Talk {
 }
 
 impl Talk {
-    fn new(submission: &Submission) -> Self {
+    fn new(submission: &Submission, frames: usize) -> Self {
         let size =
             submission.cameras.first().map_or((0, 0), |camera| (camera.width, camera.height));
-        Talk { id: None, size, frames: submission.cameras.len() as u64, seen: 0, done: None }
+        Talk { id: None, size, frames: frames as u64, seen: 0, done: None }
     }
 
     /// The summary, once every frame has come: it may overtake the last frames, which are
@@ -270,7 +429,8 @@ struct Plan {
 }
 
 impl Submission {
-    fn clone_plan(&self) -> Plan {
+    /// A plan of these frames.
+    fn plan(&self, frames: &[FrameIndex]) -> Plan {
         let (index, _) = self.store.index_blob();
         let (width, height) =
             self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
@@ -284,11 +444,12 @@ impl Submission {
             width,
             height,
             split: self.split,
-            frames: self.cameras.len() as u32,
+            frames: frames.len() as u32,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
         };
-        Plan { submit, cameras: self.cameras.clone() }
+        let cameras = frames.iter().map(|&frame| self.cameras[frame as usize]).collect();
+        Plan { submit, cameras }
     }
 }
 

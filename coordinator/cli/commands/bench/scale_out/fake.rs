@@ -22,9 +22,8 @@ use terrafarm_common::id::FrameIndex;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_coordinator::client::{self, Submission, Update};
+use terrafarm_coordinator::client::{self, Coordinator, Submission, Update};
 use terrafarm_terrain::store::StoreReader;
-use terrafarm_wire::link::Trust;
 use terrafarm_wire::message::ShotDone;
 use terrafarm_worker::sleeper::{GREY, Sleeper, Slept};
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
@@ -272,15 +271,15 @@ async fn submit(address: &str, submission: Submission) -> anyhow::Result<ShotDon
                     index
                 }
                 Update::FrameFailed(index, _) => index,
-                Update::Progress(_) => continue,
+                Update::Progress(_) | Update::Lost(_) => continue,
             };
             let _ = taken.send(index).await;
         }
         wrong
     });
     let stop = CancellationToken::new();
-    let done =
-        client::render(address, &Trust::Loopback, submission, updates, taken_out, stop).await?;
+    let coordinator = Coordinator::local(address);
+    let done = client::render(&coordinator, submission, updates, taken_out, stop).await?;
     let wrong = checking.await.context("the frames were not checked")?;
     ensure!(wrong == 0, "{wrong} frames are not what the workers sent");
     Ok(done)

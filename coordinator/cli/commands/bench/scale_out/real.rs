@@ -30,11 +30,10 @@ use terrafarm_common::image::Rgb8;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Haze, Shading, Sky, Sun};
-use terrafarm_coordinator::client::{self, Submission, Update};
+use terrafarm_coordinator::client::{self, Coordinator, Submission, Update};
 use terrafarm_coordinator::sink;
 use terrafarm_synth::SynthSpec;
 use terrafarm_terrain::store::{StoreReader, hash_of};
-use terrafarm_wire::link::Trust;
 use terrafarm_wire::message::ShotDone;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -276,21 +275,14 @@ async fn render(
                     eprintln!("terrafarm: frame {index} failed: {why}");
                     index
                 }
-                Update::Progress(_) => continue,
+                Update::Progress(_) | Update::Lost(_) => continue,
             };
             let _ = taken.send(index).await;
         }
         frames
     });
-    let done = client::render(
-        address,
-        &Trust::Loopback,
-        shot,
-        updates,
-        taken_out,
-        CancellationToken::new(),
-    )
-    .await?;
+    let (coordinator, stop) = (Coordinator::local(address), CancellationToken::new());
+    let done = client::render(&coordinator, shot, updates, taken_out, stop).await?;
     Ok((done, keeping.await.context("the frames were not kept")?))
 }
 
