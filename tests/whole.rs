@@ -14,6 +14,10 @@ mod tidy;
 #[path = "whole/farm.rs"]
 mod farm;
 
+/// Twenty times kill -9.
+#[path = "whole/faults.rs"]
+mod faults;
+
 /// Whoever has not the token, floods, dawdles or lies harms nobody who works.
 #[path = "whole/hostile.rs"]
 mod hostile;

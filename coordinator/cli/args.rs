@@ -573,6 +573,10 @@ pub struct BenchScaleOut {
     #[arg(long, default_value_t = 3, conflicts_with = "fake",
         value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub repeats: u32,
+    /// Put every worker behind a link of so many megabits per second each way: Linux, as root
+    #[arg(long, value_name = "MBIT", conflicts_with = "fake",
+        value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub link: Option<u32>,
     /// Folder that keeps the terrain, and where it is looked for [default: a temporary one]
     #[arg(long, value_name = "FOLDER", conflicts_with = "fake")]
     pub stores: Option<PathBuf>,

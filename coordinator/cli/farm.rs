@@ -1,11 +1,15 @@
 //! A farm on this PC: a coordinator inside this process, workers as child processes.
 
+use crate::secret;
 use anyhow::Context;
+use std::ffi::OsString;
 use std::net::SocketAddr;
+use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 use terrafarm_coordinator::{Config, CoordinatorError};
+use terrafarm_wire::link::{FarmToken, Trust};
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};
 use tokio::task::{JoinHandle, JoinSet};
@@ -48,34 +52,71 @@ impl Crew {
     }
 }
 
+/// How a worker is started.
+#[derive(Debug, Clone)]
+pub struct Recruit {
+    /// The program, and what comes before "worker": to start it elsewhere, for example.
+    pub command: Vec<OsString>,
+    /// The coordinator, as the worker sees it.
+    pub coordinator: String,
+    /// The farm token, if the coordinator is not on the worker's loopback.
+    pub token: Option<FarmToken>,
+    /// What to call it.
+    pub name: String,
+    /// Its threads.
+    pub threads: u32,
+}
+
 impl LocalFarm {
     /// Starts the coordinator and the workers. Workers end by themselves when the
     /// coordinator goes away, however it does.
     pub async fn start(crew: Crew) -> anyhow::Result<Self> {
-        let listener = TcpListener::bind("127.0.0.1:0")
+        let program = std::env::current_exe().context("cannot find this program's own file")?;
+        let recruit = |number: u32, address: SocketAddr| Recruit {
+            command: vec![program.clone().into_os_string()],
+            coordinator: address.to_string(),
+            token: None,
+            name: format!("local-{number}"),
+            threads: crew.threads,
+        };
+        Self::with(crew.workers, "127.0.0.1:0", Trust::Loopback, recruit).await
+    }
+
+    /// As [`LocalFarm::start`], with workers that are started some other way; they are
+    /// numbered from 1 and told the port that is listened on.
+    pub async fn with(
+        workers: u32,
+        listen: &str,
+        trust: Trust,
+        recruit: impl Fn(u32, SocketAddr) -> Recruit,
+    ) -> anyhow::Result<Self> {
+        let listener = TcpListener::bind(listen)
             .await
-            .context("cannot listen on the loopback address; is networking disabled here?")?;
-        let address = listener.local_addr().context("cannot read the address listened on")?;
+            .with_context(|| format!("cannot listen on {listen}; is networking disabled here?"))?;
+        let heard = listener.local_addr().context("cannot read the address listened on")?;
+        let address = SocketAddr::from(([127, 0, 0, 1], heard.port()));
         let (stop_workers, stop_coordinator) = (CancellationToken::new(), CancellationToken::new());
         let deserted = CancellationToken::new();
         // The last clone to be dropped is that of the last worker.
         let leaving = Arc::new(deserted.clone().drop_guard());
-        let config = Config { name: "local".into(), ..Config::default() };
+        let config = Config { name: "local".into(), trust, ..Config::default() };
         let until = stop_coordinator.clone().cancelled_owned();
         let coordinator = tokio::spawn(terrafarm_coordinator::run(config, listener, until));
-        let mut workers = JoinSet::new();
-        for number in 1..=crew.workers {
+        let mut crew = JoinSet::new();
+        for number in 1..=workers {
             let until = stop_workers.clone();
+            let recruit = recruit(number, address);
             // The first start is checked here, so that a missing program is an error at
             // once and not a farm without workers.
-            let child = start_worker(address, number, crew.threads)?;
+            let child = recruit.start()?;
             let present = leaving.clone();
-            workers.spawn(async move {
-                let ended = keep_alive(child, address, number, crew.threads, until).await;
+            crew.spawn(async move {
+                let ended = keep_alive(child, recruit, until).await;
                 drop(present);
                 ended
             });
         }
+        let workers = crew;
         Ok(LocalFarm { address, deserted, stop_workers, stop_coordinator, workers, coordinator })
     }
 
@@ -89,32 +130,38 @@ impl LocalFarm {
     }
 }
 
-fn start_worker(address: SocketAddr, number: u32, threads: u32) -> anyhow::Result<Child> {
-    let program = std::env::current_exe().context("cannot find this program's own file")?;
-    Command::new(&program)
-        .arg("worker")
-        .args(["--coordinator", &address.to_string(), "--plain"])
-        .args(["--name", &format!("local-{number}")])
-        .args(["--threads", &threads.to_string()])
-        // The store is on this PC already: a second copy on disk would serve nobody.
-        .args(["--cache-limit", "0"])
-        .arg("--once")
-        // Whoever started this process is not told about its children.
-        .env_remove("NOTIFY_SOCKET")
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .kill_on_drop(true)
-        .spawn()
-        .with_context(|| format!("cannot start a worker process from {}", program.display()))
+impl Recruit {
+    fn start(&self) -> anyhow::Result<Child> {
+        let (program, before) = self.command.split_first().context("no program to start")?;
+        let mut command = Command::new(program);
+        command.args(before).arg("worker").args(["--coordinator", &self.coordinator]);
+        match &self.token {
+            Some(token) => _ = command.env(secret::VARIABLE, token.to_text()),
+            None => _ = command.arg("--plain"),
+        }
+        command
+            .args(["--name", &self.name, "--threads", &self.threads.to_string()])
+            // The store is on this PC already: a second copy on disk would serve nobody.
+            .args(["--cache-limit", "0"])
+            .arg("--once")
+            // Whoever started this process is not told about its children.
+            .env_remove("NOTIFY_SOCKET")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .kill_on_drop(true)
+            .spawn()
+            .with_context(|| {
+                format!("cannot start a worker process from {}", Path::new(program).display())
+            })
+    }
 }
 
 async fn keep_alive(
     mut child: Child,
-    address: SocketAddr,
-    number: u32,
-    threads: u32,
+    recruit: Recruit,
     stop: CancellationToken,
 ) -> anyhow::Result<()> {
+    let worker = recruit.name.as_str();
     for _ in 0..=RESTARTS_PER_WORKER {
         tokio::select! {
             () = stop.cancelled() => {
@@ -124,12 +171,12 @@ async fn keep_alive(
             }
             ended = child.wait() => {
                 let how = ended.map_or_else(|error| error.to_string(), |status| status.to_string());
-                tracing::warn!(worker = number, %how, "a local worker ended; starting it again");
+                tracing::warn!(worker, %how, "a local worker ended; starting it again");
             }
         }
         tokio::time::sleep(RESTART_PAUSE).await;
-        child = start_worker(address, number, threads)?;
+        child = recruit.start()?;
     }
-    tracing::error!(worker = number, "a local worker keeps ending; going on without it");
+    tracing::error!(worker, "a local worker keeps ending; going on without it");
     Ok(())
 }

@@ -18,6 +18,7 @@ mod secret;
 mod shot;
 
 use clap::Parser;
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 /// How a command that ran to its end ended.
@@ -83,7 +84,10 @@ fn log_to_stderr(verbose: u8) {
         1 => tracing::Level::INFO,
         _ => tracing::Level::DEBUG,
     };
-    tracing_subscriber::fmt().with_max_level(level).with_writer(std::io::stderr).init();
+    // Colours are for people: a log that goes to a file or another program has none.
+    let ansi = std::io::stderr().is_terminal();
+    let log = tracing_subscriber::fmt().with_max_level(level).with_writer(std::io::stderr);
+    log.with_ansi(ansi).init();
 }
 
 #[cfg(test)]

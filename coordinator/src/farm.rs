@@ -223,6 +223,8 @@ impl Farm {
             }
             Message::Cameras(cameras) => match self.shots.add_cameras(client, &cameras) {
                 Ok(Some((accepted, event))) => {
+                    let frames = self.shots.get(accepted.shot).map_or(0, |shot| shot.submit.frames);
+                    tracing::info!(shot = %accepted.shot, frames, "shot submitted");
                     self.send(Peer::Client(client), accepted);
                     self.schedule(now, event);
                 }

@@ -207,8 +207,12 @@ impl Drop for Running {
 
 /// A coordinator of its own process, and its address.
 pub fn coordinator() -> (Running, String) {
-    let mut running =
-        Running::start(terrafarm().args(["-v", "coordinator", "--listen", "127.0.0.1:0"]));
+    coordinator_on("127.0.0.1:0")
+}
+
+/// A coordinator of its own process at an address, and the address with its port.
+pub fn coordinator_on(listen: &str) -> (Running, String) {
+    let mut running = Running::start(terrafarm().args(["-v", "coordinator", "--listen", listen]));
     let line = running.expect("coordinator on ");
     let address = line.rsplit(' ').next().unwrap().to_owned();
     (running, address)

@@ -26,6 +26,24 @@ pub fn cpu_s_of(_process: u32) -> Option<f64> {
     None
 }
 
+/// CPU time that everything on this PC has had, all cores together, seconds; on Linux.
+#[cfg(target_os = "linux")]
+pub fn all_cpu_s() -> Option<f64> {
+    let stat = std::fs::read_to_string("/proc/stat").ok()?;
+    let ticks = stat.lines().next()?.strip_prefix("cpu ")?.split_ascii_whitespace();
+    let ticks: Vec<u64> = ticks.map_while(|field| field.parse().ok()).collect();
+    // user, nice, system, idle, waiting for a disk, two of interrupts.
+    let [user, nice, system, _, _, hard, soft, ..] = ticks[..] else { return None };
+    let busy = [user, nice, system, hard, soft].into_iter().fold(0u64, u64::saturating_add);
+    Some(busy as f64 / rustix::param::clock_ticks_per_second() as f64)
+}
+
+/// As above, elsewhere.
+#[cfg(not(target_os = "linux"))]
+pub fn all_cpu_s() -> Option<f64> {
+    None
+}
+
 /// Ticks in user and in kernel mode of a `stat` line. The name before them may hold
 /// anything, blanks and brackets included; the last bracket ends it.
 #[cfg(target_os = "linux")]

@@ -10,15 +10,18 @@
 use super::super::chart::{self, stack};
 use super::super::report::{digits, save, table};
 use super::account::Account;
+use super::links::{Carried, Links};
 use super::process;
 use crate::commands::bench::land::{Land, Load};
 use crate::commands::runtime;
-use crate::farm::{Crew, LocalFarm};
+use crate::farm::{Crew, LocalFarm, Recruit};
 use crate::{Outcome, args};
 use anyhow::{Context, bail, ensure};
 use glam::DVec3;
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -34,6 +37,7 @@ use terrafarm_coordinator::client::{self, Coordinator, Submission, Update};
 use terrafarm_coordinator::sink;
 use terrafarm_synth::SynthSpec;
 use terrafarm_terrain::store::{StoreReader, hash_of};
+use terrafarm_wire::link::{FarmToken, Trust};
 use terrafarm_wire::message::ShotDone;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -101,6 +105,20 @@ pub struct Run {
     coordinator_cores: Option<f64>,
     /// Shares of the workers' time.
     pub account: Account,
+    /// How much of the links was used, if they have a limit.
+    pub links: Option<LinkUse>,
+    /// CPU time of all over what the cores of this PC have: 1 when they are the limit.
+    cores_used: Option<f64>,
+}
+
+/// How much of the links between workers and coordinator was used.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct LinkUse {
+    mbit_per_s: u32,
+    /// Share of what all links together carry from the workers.
+    pub up: f64,
+    /// Share of what they carry to the workers.
+    pub down: f64,
 }
 
 /// What a crew did once.
@@ -108,6 +126,9 @@ struct Pass {
     done: ShotDone,
     seconds: f64,
     cpu_s: Option<f64>,
+    /// CPU time of everything on this PC.
+    all_cpu_s: Option<f64>,
+    links: Option<LinkUse>,
     sha256: String,
 }
 
@@ -135,7 +156,7 @@ pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
     let mut passes: Vec<Vec<Pass>> = crews.iter().map(|_| Vec::new()).collect();
     for _ in 0..repeats {
         for (crew, passes) in crews.iter().zip(&mut passes) {
-            let pass = runtime.block_on(fly(*crew, &yard, &store, &cameras))?;
+            let pass = runtime.block_on(fly(*crew, args.link, &yard, &store, &cameras))?;
             eprintln!(
                 "terrafarm: {} x {} threads: {} frames/s",
                 crew.workers,
@@ -228,11 +249,16 @@ fn submission(store: &Arc<StoreReader>, cameras: Vec<Camera>, split: Split) -> S
 /// timed.
 async fn fly(
     crew: Crew,
+    link_mbit: Option<u32>,
     yard: &Arc<StoreReader>,
     store: &Arc<StoreReader>,
     cameras: &[Camera],
 ) -> anyhow::Result<Pass> {
-    let farm = LocalFarm::start(crew).await?;
+    let links = link_mbit.map(|mbit| Links::build(crew.workers, mbit)).transpose()?;
+    let farm = match &links {
+        Some(links) => behind(links, crew).await?,
+        None => LocalFarm::start(crew).await?,
+    };
     let address = farm.address.to_string();
     let began = Instant::now();
     loop {
@@ -245,15 +271,45 @@ async fn fly(
         }
         ensure!(began.elapsed() < JOIN_LIMIT, "not every worker joins; is this PC very busy?");
     }
-    let cpu = process::own_cpu_s();
+    let before = links.as_ref().map(Links::carried).transpose()?;
+    let (cpu, all_cpu) = (process::own_cpu_s(), process::all_cpu_s());
     let shot = submission(store, cameras.to_vec(), Split::Columns);
     let (done, frames) = render(&address, shot).await?;
     let cpu_s = cpu.zip(process::own_cpu_s()).map(|(before, after)| after - before);
+    let all_cpu_s = all_cpu.zip(process::all_cpu_s()).map(|(before, after)| after - before);
+    let after = links.as_ref().map(Links::carried).transpose()?;
     farm.stop().await;
     ensure!(frames.len() == cameras.len(), "{} frames failed", cameras.len() - frames.len());
     let hashes: Vec<u8> = frames.values().flat_map(|frame| sink::pixels_sha256(frame).0).collect();
     let seconds = (done.elapsed_us as f64 * 1e-6).max(1e-6);
-    Ok(Pass { done, seconds, cpu_s, sha256: hash_of(&hashes).to_hex() })
+    let links = links.zip(before.zip(after)).zip(link_mbit).map(
+        |((links, (before, after)), mbit_per_s)| {
+            let whole = links.bytes_per_s(crew.workers) * seconds;
+            let share = |of: fn(Carried) -> u64| (of(after) - of(before)) as f64 / whole;
+            LinkUse { mbit_per_s, up: share(|sum| sum.up), down: share(|sum| sum.down) }
+        },
+    );
+    Ok(Pass { done, seconds, cpu_s, all_cpu_s, links, sha256: hash_of(&hashes).to_hex() })
+}
+
+/// A farm whose workers are each behind a link. They speak as in an office: encrypted, with
+/// packed pixels. The client stays on this PC.
+async fn behind(links: &Links, crew: Crew) -> anyhow::Result<LocalFarm> {
+    let program = std::env::current_exe().context("cannot find this program's own file")?;
+    let token = FarmToken::generate()?;
+    let recruit = |number: u32, address: SocketAddr| {
+        let space = links.namespace(number - 1).unwrap_or_default();
+        let before = ["ip", "netns", "exec", space].map(OsString::from);
+        let command = before.into_iter().chain([program.clone().into_os_string()]).collect();
+        Recruit {
+            command,
+            coordinator: format!("{}:{}", links.hub(), address.port()),
+            token: Some(token.clone()),
+            name: format!("linked-{number}"),
+            threads: crew.threads,
+        }
+    };
+    LocalFarm::with(crew.workers, "0.0.0.0:0", Trust::Token(token.clone()), recruit).await
 }
 
 /// Renders a shot into memory.
@@ -317,6 +373,8 @@ fn judge(
             jobs_repeated: pass.done.jobs_repeated,
             coordinator_cores: pass.cpu_s.map(|cpu_s| cpu_s / pass.seconds),
             account,
+            links: pass.links,
+            cores_used: pass.all_cpu_s.map(|cpu_s| cpu_s / pass.seconds / cores as f64),
         });
     }
     let of = |runs: &[Run], workers, threads| {
@@ -394,6 +452,18 @@ fn text(report: &Report) -> String {
              {cores} cores; the run in the middle of {repeats}\nfrom render on: percent of the \
              workers' time from the submission to the last frame; the same bytes from all\n"
         );
+    for run in &report.runs {
+        let Some(links) = run.links else { continue };
+        text += &format!(
+            "{} behind links of {} Mbit/s: {:.1} % of them used up to the coordinator, {:.1} % down; {} % \
+             of the cores\n",
+            run.name(),
+            links.mbit_per_s,
+            100.0 * links.up,
+            100.0 * links.down,
+            run.cores_used.map_or("?".into(), |used| digits(100.0 * used)),
+        );
+    }
     if let Some(two) = report.two_processes_over_two_threads {
         text += &format!("2 workers over 1 worker of 2 threads: {:.1} %\n", 100.0 * two);
     }
