@@ -13,7 +13,7 @@ use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
 use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
@@ -213,7 +213,7 @@ async fn drive(
             },
             _ = looks.tick() => {
                 views.send_if_modified(|view| {
-                    *view = Arc::new(farm.view(now()));
+                    *view = Arc::new(farm.view(now(), wall_s()));
                     true
                 });
             }
@@ -228,6 +228,11 @@ async fn drive(
         let _ = line.outbox.try_send(Goodbye { reason: "the coordinator stops".into() });
         line.hang_up.cancel();
     }
+}
+
+/// Seconds since 1970 began.
+fn wall_s() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
 }
 
 async fn sleep_until(due: Option<Instant>) {

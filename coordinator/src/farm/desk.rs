@@ -1,5 +1,6 @@
 //! What the farm shows of itself, and the orders it takes.
 
+use super::tally::ShotTally;
 use super::{Farm, Peer};
 use crate::order::{Order, OrderError};
 use crate::shots::Shot;
@@ -9,20 +10,21 @@ use terrafarm_sched::{Event, Micros};
 use terrafarm_wire::message::{Drain, ShotFailed};
 
 impl Farm {
-    /// Everything at this moment.
-    pub fn view(&self, now: Micros) -> FarmView {
+    /// Everything at this moment, which is `wall_s` seconds after 1970 began.
+    pub fn view(&mut self, now: Micros, wall_s: u64) -> FarmView {
+        self.tally.advance(now);
         let account = self.scheduler.account();
-        let shots: Vec<_> = self.shots.iter().map(|(id, state)| view_shot(id, state)).collect();
+        let shots = self.shots.iter().map(|(id, shot)| self.view_shot(now, wall_s, id, shot));
         FarmView {
             at_ms: now.0 / 1000,
-            workers: self.view_workers(),
+            workers: self.view_workers(now),
             jobs_running: self.scheduler.leases_held() as u64,
             jobs_done: account.accepted,
             jobs_repeated: account.failed + account.expired + account.lost,
             results_refused: account.refused,
-            frames_done: shots.iter().map(|shot| u64::from(shot.frames_done)).sum(),
-            shots,
-            history: Vec::new(),
+            frames_done: self.tally.frames_done,
+            shots: shots.collect(),
+            history: self.tally.history(),
         }
     }
 
@@ -33,17 +35,17 @@ impl Farm {
     pub fn order(&mut self, now: Micros, order: Order) -> Result<String, OrderError> {
         match order {
             Order::Pause(shot) => {
-                self.known(shot)?;
+                self.known(shot)?.is_paused = true;
                 self.schedule(now, Event::ShotPaused { shot });
                 Ok(format!("{shot} waits"))
             }
             Order::Resume(shot) => {
-                self.known(shot)?;
+                self.known(shot)?.is_paused = false;
                 self.schedule(now, Event::ShotResumed { shot });
                 Ok(format!("{shot} goes on"))
             }
             Order::Prioritise(shot, priority) => {
-                self.known(shot)?;
+                self.known(shot)?.priority = Some(priority);
                 self.schedule(now, Event::ShotPrioritised { shot, priority });
                 Ok(format!("{shot} has priority {priority}"))
             }
@@ -68,6 +70,7 @@ impl Farm {
                     return Err(OrderError::NoWorker(worker));
                 }
                 self.send(Peer::Worker(worker), Drain {});
+                self.tally.draining(worker);
                 self.schedule(now, Event::WorkerDraining { worker });
                 Ok(format!("{worker} finishes what it renders and leaves"))
             }
@@ -75,8 +78,10 @@ impl Farm {
         }
     }
 
-    fn known(&self, shot: ShotId) -> Result<(), OrderError> {
-        self.shots.get(shot).map(|_| ()).ok_or(OrderError::NoShot(shot))
+    /// The counts of a shot that there is.
+    fn known(&mut self, shot: ShotId) -> Result<&mut ShotTally, OrderError> {
+        self.shots.get(shot).ok_or(OrderError::NoShot(shot))?;
+        Ok(self.tally.shots.entry(shot).or_default())
     }
 
     /// Why a frame is not done.
@@ -97,14 +102,20 @@ impl Farm {
         })
     }
 
-    fn view_workers(&self) -> Vec<WorkerView> {
+    fn view_workers(&self, now: Micros) -> Vec<WorkerView> {
         let view = |(&id, state): (&_, &super::WorkerState)| {
             let first = state.leases.first().and_then(|lease| self.granted.get(lease));
+            let tally = self.tally.workers.get(&id);
+            let [rendering, terrain] = tally.map_or([0.0; 2], |tally| tally.shares(now));
             WorkerView {
                 id,
                 name: state.greeting.name.clone(),
                 threads: state.greeting.threads,
-                state: if state.leases.is_empty() { WorkerState::Idle } else { WorkerState::Busy },
+                state: match tally {
+                    Some(tally) if tally.is_draining => WorkerState::Draining,
+                    _ if state.leases.is_empty() => WorkerState::Idle,
+                    _ => WorkerState::Busy,
+                },
                 speed: 1.0,
                 job: first.map(|job| JobView {
                     shot: job.shot,
@@ -112,35 +123,41 @@ impl Farm {
                     region: [job.region.x, job.region.y, job.region.width, job.region.height],
                 }),
                 jobs_held: state.leases.len() as u32,
-                jobs_done: 0,
-                jobs_failed: 0,
-                heard_ms: 0,
-                rendering: 0.0,
-                terrain: 0.0,
-                blocked: Vec::new(),
+                jobs_done: tally.map_or(0, |tally| tally.jobs_done),
+                jobs_failed: tally.map_or(0, |tally| tally.jobs_failed),
+                heard_ms: tally.map_or(0, |tally| tally.silent_us(now) / 1000),
+                rendering,
+                terrain,
+                blocked: tally.map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
                 distrusted: false,
             }
         };
         self.workers.iter().map(view).collect()
     }
-}
 
-fn view_shot(id: ShotId, state: &Shot) -> ShotView {
-    ShotView {
-        id,
-        name: state.submit.name.clone(),
-        state: ShotState::Running,
-        note: String::new(),
-        priority: state.submit.priority,
-        queued: false,
-        frames: state.submit.frames,
-        frames_done: state.frames_done,
-        frames_failed: state.frames_failed,
-        size: [state.submit.width, state.submit.height],
-        method: state.submit.quality.method.name().to_owned(),
-        submitted_s: 0,
-        frames_per_s: 0.0,
-        eta_s: None,
-        last_frame: None,
+    fn view_shot(&self, now: Micros, wall_s: u64, id: ShotId, shot: &Shot) -> ShotView {
+        let fresh = ShotTally::default();
+        let tally = self.tally.shots.get(&id).unwrap_or(&fresh);
+        let submit = &shot.submit;
+        let left = submit.frames.saturating_sub(shot.frames_done + shot.frames_failed);
+        let frames_per_s = tally.frames_per_s(now);
+        let will_end = frames_per_s > 0.0 && !tally.is_paused;
+        ShotView {
+            id,
+            name: submit.name.clone(),
+            state: if tally.is_paused { ShotState::Paused } else { ShotState::Running },
+            note: String::new(),
+            priority: tally.priority.unwrap_or(submit.priority),
+            queued: false,
+            frames: submit.frames,
+            frames_done: shot.frames_done,
+            frames_failed: shot.frames_failed,
+            size: [submit.width, submit.height],
+            method: submit.quality.method.name().to_owned(),
+            submitted_s: wall_s.saturating_sub(now.since(shot.since) / 1_000_000),
+            frames_per_s,
+            eta_s: will_end.then(|| f64::from(left) / frames_per_s),
+            last_frame: tally.last_frame,
+        }
     }
 }
