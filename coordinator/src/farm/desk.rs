@@ -133,6 +133,7 @@ fn view_shot(id: ShotId, state: &Shot) -> ShotView {
         note: String::new(),
         priority: state.submit.priority,
         queued: false,
+        first_frame: 0,
         frames: state.submit.frames,
         frames_done: state.frames_done,
         frames_failed: state.frames_failed,
