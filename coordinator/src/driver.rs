@@ -145,7 +145,6 @@ pub enum ToDriver {
 
 /// The way from the desk to the driver.
 #[derive(Clone)]
-#[expect(dead_code, reason = "the desk comes next")]
 pub struct FarmLine {
     events: mpsc::Sender<ToDriver>,
     view: watch::Receiver<Arc<FarmView>>,

@@ -12,6 +12,7 @@ mod driver;
 mod farm;
 pub mod order;
 mod peer;
+pub mod queue;
 mod shots;
 pub mod sink;
 mod strangers;

@@ -138,6 +138,8 @@ pub struct ShotView {
     pub priority: i32,
     /// Whether it is in the queue on disk; else it ends with the client that submitted it.
     pub queued: bool,
+    /// Number of the first frame within the flight; frames are named by such numbers.
+    pub first_frame: FrameIndex,
     /// Number of frames.
     pub frames: u32,
     /// Frames finished.

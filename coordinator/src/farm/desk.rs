@@ -149,6 +149,7 @@ impl Farm {
             note: String::new(),
             priority: tally.priority.unwrap_or(submit.priority),
             queued: false,
+            first_frame: 0,
             frames: submit.frames,
             frames_done: shot.frames_done,
             frames_failed: shot.frames_failed,
