@@ -4,10 +4,13 @@
 //! wait, and TCP slows the senders down. Each peer's outbox is bounded; a peer whose
 //! outbox is full does not read, and is dropped.
 
+use crate::api::{self, Desk, Web};
 use crate::blobs::ClientId;
 use crate::farm::{Farm, Out, Peer, PeerEvent};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
+use crate::queue::{Queue, QueueConfig, QueueError};
+use crate::thumbnails::Thumbnails;
 use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
@@ -83,6 +86,18 @@ pub enum CoordinatorError {
          strangers; give one, or say --plain on a network you trust"
     )]
     NoToken(SocketAddr),
+    /// Its queue on disk cannot be used.
+    #[error(transparent)]
+    Queue(#[from] QueueError),
+}
+
+/// What a coordinator may have beside its farm.
+#[derive(Default)]
+pub struct Office {
+    /// Shots that outlive whoever submitted them.
+    pub queue: Option<QueueConfig>,
+    /// The API by HTTP, and the page.
+    pub web: Option<Web>,
 }
 
 /// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
@@ -96,6 +111,19 @@ pub async fn run(
     listener: TcpListener,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
+    run_office(config, listener, Office::default(), shutdown).await
+}
+
+/// As [`run`], with a queue and a page.
+///
+/// # Errors
+/// As [`run`], and if the queue cannot be opened.
+pub async fn run_office(
+    config: Config,
+    listener: TcpListener,
+    office: Office,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), CoordinatorError> {
     let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
     if matches!(config.trust, Trust::Loopback) && !is_this_pc(address.ip()) {
         return Err(CoordinatorError::NoToken(address));
@@ -103,10 +131,25 @@ pub async fn run(
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
-    let (views, _view) = watch::channel(Arc::default());
-    let driver = tasks.spawn(drive(config.clone(), inbox, views, stop.clone()));
+    let (views, view) = watch::channel(Arc::default());
+    let thumbnails = Arc::<Thumbnails>::default();
+    let driver =
+        tasks.spawn(drive(config.clone(), inbox, views, thumbnails.clone(), stop.clone()));
+    let farm = FarmLine { events: events.clone(), view };
+    let queue = match office.queue {
+        Some(config) => {
+            let (queue, task) = Queue::open(config, farm.clone()).await?;
+            tasks.spawn(task.run(stop.clone()));
+            Some(queue)
+        }
+        None => None,
+    };
+    let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
+    if let Some(web) = office.web {
+        tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
+    }
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events);
+    let admission = Admission::new(&config, events, api::router(desk), stop.clone());
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -179,6 +222,7 @@ async fn drive(
     config: Config,
     mut inbox: mpsc::Receiver<ToDriver>,
     views: watch::Sender<Arc<FarmView>>,
+    thumbnails: Arc<Thumbnails>,
     stop: CancellationToken,
 ) {
     let epoch = Instant::now();
@@ -218,7 +262,7 @@ async fn drive(
             }
         }
         while let Some(out) = farm.poll_out() {
-            if let Some((peer, why)) = carry(out, &mut lines) {
+            if let Some((peer, why)) = carry(out, &mut lines, &thumbnails) {
                 farm.handle(now(), peer, PeerEvent::Gone(LostReason::Broken, why));
             }
         }
@@ -242,7 +286,11 @@ async fn sleep_until(due: Option<Instant>) {
 }
 
 /// Carries out one order. Returns a peer that has to be given up, and why.
-fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
+fn carry(
+    out: Out,
+    lines: &mut HashMap<Peer, Line>,
+    thumbnails: &Arc<Thumbnails>,
+) -> Option<(Peer, String)> {
     match out {
         Out::Send(peer, message) => {
             let line = lines.get(&peer)?;
@@ -257,8 +305,11 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
             let line = lines.get(&peer)?;
             let (outbox, hang_up) = (line.outbox.clone(), line.hang_up.clone());
             let loopback = line.loopback;
+            let thumbnails = thumbnails.clone();
             // At most as many at once as frames may be in flight.
             tokio::task::spawn_blocking(move || {
+                let (shot, frame) = head.place();
+                thumbnails.keep(shot, frame, &picture);
                 let pixels = picture.into_pixels().into();
                 let packed =
                     if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };

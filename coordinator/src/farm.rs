@@ -160,7 +160,6 @@ impl Farm {
     }
 
     fn hear_worker(&mut self, now: Micros, worker: WorkerId, message: Message) {
-        self.tally.heard(worker, now);
         self.schedule(now, Event::HeardFrom { worker });
         match message {
             Message::Pong(_) => {}
@@ -180,7 +179,6 @@ impl Farm {
                 for &lease in &back.leases {
                     self.end_lease(worker, lease);
                 }
-                self.tally.draining(worker);
                 self.schedule(now, Event::WorkerDraining { worker });
                 self.schedule(now, Event::HandedBack { worker, leases: back.leases });
             }

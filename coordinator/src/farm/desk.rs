@@ -6,8 +6,11 @@ use crate::order::{Order, OrderError};
 use crate::shots::Shot;
 use crate::view::{FarmView, JobView, ShotState, ShotView, WorkerState, WorkerView};
 use terrafarm_common::id::{FrameIndex, ShotId};
-use terrafarm_sched::{Event, Micros};
+use terrafarm_sched::{Event, Micros, Why};
 use terrafarm_wire::message::{Drain, ShotFailed};
+
+/// How many workers a sentence names; of more it gives the number.
+const NAMED: usize = 8;
 
 impl Farm {
     /// Everything at this moment, which is `wall_s` seconds after 1970 began.
@@ -35,17 +38,17 @@ impl Farm {
     pub fn order(&mut self, now: Micros, order: Order) -> Result<String, OrderError> {
         match order {
             Order::Pause(shot) => {
-                self.known(shot)?.is_paused = true;
+                self.known(shot)?;
                 self.schedule(now, Event::ShotPaused { shot });
                 Ok(format!("{shot} waits"))
             }
             Order::Resume(shot) => {
-                self.known(shot)?.is_paused = false;
+                self.known(shot)?;
                 self.schedule(now, Event::ShotResumed { shot });
                 Ok(format!("{shot} goes on"))
             }
             Order::Prioritise(shot, priority) => {
-                self.known(shot)?.priority = Some(priority);
+                self.known(shot)?;
                 self.schedule(now, Event::ShotPrioritised { shot, priority });
                 Ok(format!("{shot} has priority {priority}"))
             }
@@ -70,7 +73,6 @@ impl Farm {
                     return Err(OrderError::NoWorker(worker));
                 }
                 self.send(Peer::Worker(worker), Drain {});
-                self.tally.draining(worker);
                 self.schedule(now, Event::WorkerDraining { worker });
                 Ok(format!("{worker} finishes what it renders and leaves"))
             }
@@ -78,10 +80,8 @@ impl Farm {
         }
     }
 
-    /// The counts of a shot that there is.
-    fn known(&mut self, shot: ShotId) -> Result<&mut ShotTally, OrderError> {
-        self.shots.get(shot).ok_or(OrderError::NoShot(shot))?;
-        Ok(self.tally.shots.entry(shot).or_default())
+    fn known(&self, shot: ShotId) -> Result<(), OrderError> {
+        self.shots.get(shot).map(|_| ()).ok_or(OrderError::NoShot(shot))
     }
 
     /// Why a frame is not done.
@@ -91,14 +91,26 @@ impl Farm {
         if frame >= frames {
             return Err(OrderError::NoFrame { shot, frames, frame });
         }
-        let held = self.granted.values().filter(|job| job.shot == shot && job.frame == frame);
-        let names: Vec<_> = held
-            .filter_map(|job| self.workers.get(&job.worker))
-            .map(|worker| worker.greeting.name.as_str())
-            .collect();
-        Ok(match names.len() {
-            0 => "no job of it runs".to_owned(),
-            jobs => format!("{jobs} jobs of it run, on {}", names.join(", ")),
+        Ok(match self.scheduler.why(shot, frame) {
+            // Names say more to people than numbers.
+            Why::Running { jobs, workers, waiting } => {
+                let names = workers.iter().filter_map(|worker| self.workers.get(worker));
+                let names: Vec<_> = names.map(|state| state.greeting.name.as_str()).collect();
+                let others = names.len().saturating_sub(NAMED);
+                let mut text = match jobs {
+                    1 => "1 job runs, on ".to_owned(),
+                    jobs => format!("{jobs} jobs run, on "),
+                };
+                text += &names[..names.len() - others].join(", ");
+                if others > 0 {
+                    text += &format!(" and {others} others");
+                }
+                if waiting > 0 {
+                    text += &format!("; {waiting} wait for a worker");
+                }
+                text
+            }
+            why => why.to_string(),
         })
     }
 
@@ -111,12 +123,14 @@ impl Farm {
                 id,
                 name: state.greeting.name.clone(),
                 threads: state.greeting.threads,
-                state: match tally {
-                    Some(tally) if tally.is_draining => WorkerState::Draining,
-                    _ if state.leases.is_empty() => WorkerState::Idle,
-                    _ => WorkerState::Busy,
+                state: if self.scheduler.is_draining(id) {
+                    WorkerState::Draining
+                } else if state.leases.is_empty() {
+                    WorkerState::Idle
+                } else {
+                    WorkerState::Busy
                 },
-                speed: 1.0,
+                speed: self.scheduler.speed_of(id).unwrap_or(1.0),
                 job: first.map(|job| JobView {
                     shot: job.shot,
                     frame: job.frame,
@@ -125,7 +139,7 @@ impl Farm {
                 jobs_held: state.leases.len() as u32,
                 jobs_done: tally.map_or(0, |tally| tally.jobs_done),
                 jobs_failed: tally.map_or(0, |tally| tally.jobs_failed),
-                heard_ms: tally.map_or(0, |tally| tally.silent_us(now) / 1000),
+                heard_ms: self.scheduler.heard_at(id).map_or(0, |heard| now.since(heard) / 1000),
                 rendering,
                 terrain,
                 blocked: tally.map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
@@ -141,13 +155,14 @@ impl Farm {
         let submit = &shot.submit;
         let left = submit.frames.saturating_sub(shot.frames_done + shot.frames_failed);
         let frames_per_s = tally.frames_per_s(now);
-        let will_end = frames_per_s > 0.0 && !tally.is_paused;
+        let is_paused = self.scheduler.is_paused(id);
+        let will_end = frames_per_s > 0.0 && !is_paused;
         ShotView {
             id,
             name: submit.name.clone(),
-            state: if tally.is_paused { ShotState::Paused } else { ShotState::Running },
+            state: if is_paused { ShotState::Paused } else { ShotState::Running },
             note: String::new(),
-            priority: tally.priority.unwrap_or(submit.priority),
+            priority: self.scheduler.priority(id).unwrap_or(submit.priority),
             queued: false,
             first_frame: 0,
             frames: submit.frames,

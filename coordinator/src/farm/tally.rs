@@ -40,14 +40,11 @@ struct Lap {
 #[derive(Debug)]
 pub struct WorkerTally {
     since: Micros,
-    heard: Micros,
     /// Jobs whose pixels were used.
     pub jobs_done: u64,
     /// Jobs that it failed at.
     pub jobs_failed: u64,
     sheet: Timesheet,
-    /// Whether it finishes what it has and leaves.
-    pub is_draining: bool,
     /// Shots that it gets no more of.
     pub blocked: BTreeSet<ShotId>,
 }
@@ -59,10 +56,6 @@ pub struct ShotTally {
     finished: VecDeque<Micros>,
     /// The frame that was finished last.
     pub last_frame: Option<FrameIndex>,
-    /// Whether it waits until someone resumes it.
-    pub is_paused: bool,
-    /// The priority it was given after its submission.
-    pub priority: Option<i32>,
 }
 
 impl Tally {
@@ -100,11 +93,9 @@ impl Tally {
         self.count_time(now);
         let tally = WorkerTally {
             since: now,
-            heard: now,
             jobs_done: 0,
             jobs_failed: 0,
             sheet: Timesheet::default(),
-            is_draining: false,
             blocked: BTreeSet::new(),
         };
         self.workers.insert(worker, tally);
@@ -115,13 +106,6 @@ impl Tally {
         self.advance(now);
         self.count_time(now);
         self.workers.remove(&worker);
-    }
-
-    /// Something came from a worker.
-    pub fn heard(&mut self, worker: WorkerId, now: Micros) {
-        if let Some(tally) = self.workers.get_mut(&worker) {
-            tally.heard = now;
-        }
     }
 
     /// The pixels of a job were used.
@@ -156,13 +140,6 @@ impl Tally {
         };
     }
 
-    /// A worker leaves when it has finished what it has.
-    pub fn draining(&mut self, worker: WorkerId) {
-        if let Some(tally) = self.workers.get_mut(&worker) {
-            tally.is_draining = true;
-        }
-    }
-
     /// A frame is finished.
     pub fn frame_done(&mut self, shot: ShotId, frame: FrameIndex, now: Micros) {
         self.frames_done += 1;
@@ -190,11 +167,6 @@ impl Tally {
 }
 
 impl WorkerTally {
-    /// Time since anything was heard of it, microseconds.
-    pub fn silent_us(&self, now: Micros) -> u64 {
-        now.since(self.heard)
-    }
-
     /// Shares of its time since it joined: rendering, and waiting for terrain.
     pub fn shares(&self, now: Micros) -> [f64; 2] {
         let total = now.since(self.since).max(1) as f64;
