@@ -133,8 +133,7 @@ pub async fn run_office(
     let tasks = TaskTracker::new();
     let (views, view) = watch::channel(Arc::default());
     let thumbnails = Arc::<Thumbnails>::default();
-    let driver =
-        tasks.spawn(drive(config.clone(), inbox, views, thumbnails.clone(), stop.clone()));
+    let driver = tasks.spawn(drive(config.clone(), inbox, views, thumbnails.clone(), stop.clone()));
     let farm = FarmLine { events: events.clone(), view };
     let queue = match office.queue {
         Some(config) => {

@@ -7,6 +7,7 @@
 //! frames to files.
 
 pub mod api;
+pub mod ask;
 mod blobs;
 pub mod client;
 mod driver;

@@ -167,7 +167,10 @@ mod tests {
     fn pictures_shrink_to_the_longest_side_and_keep_their_content() {
         let small = shrink(&halves(1920, 1080));
         assert_eq!((small.width(), small.height()), (480, 270));
-        assert_eq!((small.get(0, 0), small.get(239, 269), small.get(240, 0)), ([0; 3], [0; 3], [255; 3]));
+        assert_eq!(
+            (small.get(0, 0), small.get(239, 269), small.get(240, 0)),
+            ([0; 3], [0; 3], [255; 3])
+        );
         assert_eq!(shrink(&halves(100, 1000)).width(), 48);
         assert_eq!(shrink(&halves(2, 16_384)).width(), 1);
         assert_eq!(shrink(&halves(64, 32)), halves(64, 32));

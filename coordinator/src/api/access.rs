@@ -153,7 +153,8 @@ impl Access {
             return Err(Refusal::new(StatusCode::MISDIRECTED_REQUEST, text));
         }
         let foreign = || {
-            let text = "another site asked for this; if that is a proxy of yours, let it pass Host on";
+            let text =
+                "another site asked for this; if that is a proxy of yours, let it pass Host on";
             Err(Refusal::new(StatusCode::FORBIDDEN, text))
         };
         if let Some(origin) = headers.get(header::ORIGIN) {
@@ -179,7 +180,9 @@ impl Access {
             None => host.split(':').next().unwrap_or_default(),
         };
         let is = |known: &str| name.trim_end_matches('.').eq_ignore_ascii_case(known);
-        name.parse::<IpAddr>().is_ok() || is("localhost") || self.names.iter().any(|known| is(known))
+        name.parse::<IpAddr>().is_ok()
+            || is("localhost")
+            || self.names.iter().any(|known| is(known))
     }
 }
 
@@ -190,7 +193,8 @@ fn shown(headers: &HeaderMap) -> Option<&str> {
         return bearer.strip_prefix("Bearer ").map(str::trim);
     }
     let cookies = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
-    let mut pairs = cookies.flat_map(|cookies| cookies.split(';')).filter_map(|one| one.split_once('='));
+    let mut pairs =
+        cookies.flat_map(|cookies| cookies.split(';')).filter_map(|one| one.split_once('='));
     pairs.find(|(name, _)| name.trim() == COOKIE).map(|(_, value)| value.trim())
 }
 
@@ -259,10 +263,14 @@ mod tests {
     #[test]
     fn only_addresses_and_names_of_this_pc_are_hosts() {
         let access = Access { key: None, names: vec!["PC-One".into()] };
-        for host in ["127.0.0.1:7879", "localhost", "[::1]:7879", "pc-one:80", "10.0.0.3", "localhost."] {
+        for host in
+            ["127.0.0.1:7879", "localhost", "[::1]:7879", "pc-one:80", "10.0.0.3", "localhost."]
+        {
             assert!(access.is_ours(host), "{host}");
         }
-        for host in ["", "evil.example", "localhost.evil.example:7879", "pc-one.evil.example", "[x]"] {
+        for host in
+            ["", "evil.example", "localhost.evil.example:7879", "pc-one.evil.example", "[x]"]
+        {
             assert!(!access.is_ours(host), "{host}");
         }
     }
@@ -281,9 +289,18 @@ mod tests {
         assert!(!check(Method::POST, &[("origin", "null")]));
         assert!(!check(Method::GET, &[("origin", "https://evil.example")]));
         assert!(!check(Method::POST, &[("sec-fetch-site", "cross-site")]));
-        assert!(!check(Method::GET, &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")]));
-        assert!(check(Method::GET, &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate")]));
-        assert!(!check(Method::POST, &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate")]));
+        assert!(!check(
+            Method::GET,
+            &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")]
+        ));
+        assert!(check(
+            Method::GET,
+            &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate")]
+        ));
+        assert!(!check(
+            Method::POST,
+            &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate")]
+        ));
         assert!(!access.check_source(&Method::GET, &headers(&[("host", "evil.example")])).is_ok());
     }
 

@@ -126,15 +126,12 @@ impl Board {
 
 impl Window {
     /// The states that are wanted; `None` for all.
-    fn states<S>(
-        &self,
-        read: impl Fn(&str) -> Option<Vec<S>>,
-    ) -> Result<Option<Vec<S>>, Refusal> {
+    fn states<S>(&self, read: impl Fn(&str) -> Option<Vec<S>>) -> Result<Option<Vec<S>>, Refusal> {
         let words = self.state.split(',').map(str::trim).filter(|word| !word.is_empty());
         let mut states: Option<Vec<S>> = None;
         for word in words {
-            let more =
-                read(word).ok_or_else(|| Refusal::malformed(format!("no state is called {word:?}")))?;
+            let more = read(word)
+                .ok_or_else(|| Refusal::malformed(format!("no state is called {word:?}")))?;
             states.get_or_insert_default().extend(more);
         }
         Ok(states)

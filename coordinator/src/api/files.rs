@@ -100,7 +100,9 @@ fn files(desk: &Desk, shot: &str) -> Result<ShotFiles, Refusal> {
         return Ok(files);
     }
     desk.board().shot(id)?;
-    Err(Refusal::not_there(format!("{id} is rendered for a client, which writes its frames itself")))
+    Err(Refusal::not_there(format!(
+        "{id} is rendered for a client, which writes its frames itself"
+    )))
 }
 
 /// A file or a part of it. Files of the queue are renamed into place and never change, so
@@ -127,7 +129,10 @@ async fn send(
         Wanted::Part { first, length } => {
             file.seek(SeekFrom::Start(first)).await.map_err(unreadable)?;
             let place = format!("bytes {first}-{}/{total}", first + length - 1);
-            (answer.status(StatusCode::PARTIAL_CONTENT).header(header::CONTENT_RANGE, place), length)
+            (
+                answer.status(StatusCode::PARTIAL_CONTENT).header(header::CONTENT_RANGE, place),
+                length,
+            )
         }
         Wanted::Nothing => {
             let place = format!("bytes */{total}");

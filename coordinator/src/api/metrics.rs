@@ -48,19 +48,26 @@ pub(super) async fn metrics(State(desk): State<Arc<Desk>>) -> Response {
         text.labelled("terrafarm_shots", "state", state.name(), count);
     }
     let waiting = board.shots.iter().filter(|shot| !shot.state.is_over());
-    let frames = waiting.map(|shot| {
-        u64::from(shot.frames.saturating_sub(shot.frames_done + shot.frames_failed))
-    });
+    let frames = waiting
+        .map(|shot| u64::from(shot.frames.saturating_sub(shot.frames_done + shot.frames_failed)));
     let gauges = [
         ("terrafarm_threads", "Render threads of all workers.", workers.threads as f64),
         ("terrafarm_jobs_running", "Jobs that workers hold.", farm.jobs_running as f64),
-        ("terrafarm_frames_waiting", "Frames that are still to be done.", frames.sum::<u64>() as f64),
+        (
+            "terrafarm_frames_waiting",
+            "Frames that are still to be done.",
+            frames.sum::<u64>() as f64,
+        ),
         (
             "terrafarm_efficiency_ratio",
             "Share of the workers' time that went into rendering that was used, last 5 s.",
             farm.history.last().map_or(0.0, |sample| sample.efficiency),
         ),
-        ("terrafarm_uptime_seconds", "Time since the coordinator started.", farm.at_ms as f64 / 1e3),
+        (
+            "terrafarm_uptime_seconds",
+            "Time since the coordinator started.",
+            farm.at_ms as f64 / 1e3,
+        ),
     ];
     for (name, help, value) in gauges {
         text.one(name, "gauge", help, value);
@@ -68,7 +75,11 @@ pub(super) async fn metrics(State(desk): State<Arc<Desk>>) -> Response {
     let counters = [
         ("terrafarm_frames_total", "Frames finished.", farm.frames_done),
         ("terrafarm_jobs_total", "Jobs whose pixels were used.", farm.jobs_done),
-        ("terrafarm_jobs_repeated_total", "Leases that had to be granted again.", farm.jobs_repeated),
+        (
+            "terrafarm_jobs_repeated_total",
+            "Leases that had to be granted again.",
+            farm.jobs_repeated,
+        ),
         ("terrafarm_results_refused_total", "Results that came too late.", farm.results_refused),
     ];
     for (name, help, value) in counters {

@@ -142,7 +142,8 @@ impl Farm {
                 heard_ms: self.scheduler.heard_at(id).map_or(0, |heard| now.since(heard) / 1000),
                 rendering,
                 terrain,
-                blocked: tally.map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
+                blocked: tally
+                    .map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
                 distrusted: false,
             }
         };
