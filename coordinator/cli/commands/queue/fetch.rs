@@ -36,9 +36,8 @@ pub fn run(args: &args::Fetch) -> anyhow::Result<Outcome> {
 
 /// All frames of a shot into a folder; its manifest comes last.
 async fn frames(desk: &mut Desk, shot: &str, folder: &Path) -> anyhow::Result<Outcome> {
-    let manifest =
-        desk.line.ask(Verb::Get, &format!("{shot}/manifest.json"), None, Default::default());
-    let text = manifest.await?.body;
+    let path = format!("{shot}/manifest.json");
+    let text = desk.line.ask(Verb::Get, &path, None, Default::default()).await?.body;
     let manifest: Manifest = serde_json::from_slice(&text)
         .context("the manifest is not understood; is the coordinator of the same version?")?;
     fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
