@@ -5,18 +5,20 @@
 //! outbox is full does not read, and is dropped.
 
 use crate::blobs::ClientId;
-use crate::farm::{Farm, Out, Peer, PeerEvent};
+use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
+use crate::queue::{Queue, QueueConfig, QueueError};
 use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
+use terrafarm_wire::link::{self, Outbox, OutboxEnd, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -54,6 +56,8 @@ pub struct Config {
     pub seed: u64,
     /// Settings of the scheduler; heartbeat and silence are told to the workers.
     pub scheduler: terrafarm_sched::Config,
+    /// The queue on disk, if there is to be one.
+    pub queue: Option<QueueConfig>,
 }
 
 impl Default for Config {
@@ -67,6 +71,7 @@ impl Default for Config {
             greeting_limit: Duration::from_secs(5),
             seed: 1,
             scheduler: terrafarm_sched::Config::default(),
+            queue: None,
         }
     }
 }
@@ -83,13 +88,16 @@ pub enum CoordinatorError {
          strangers; give one, or say --plain on a network you trust"
     )]
     NoToken(SocketAddr),
+    /// The queue on disk cannot be used.
+    #[error(transparent)]
+    Queue(#[from] QueueError),
 }
 
 /// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
 /// function returns when every connection has ended.
 ///
 /// # Errors
-/// If the socket cannot be used at all; refused connections and lost peers are normal
+/// If the socket or the queue on disk cannot be used at all; refused connections and lost peers are normal
 /// work and only logged.
 pub async fn run(
     config: Config,
@@ -103,8 +111,15 @@ pub async fn run(
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
-    let (views, _view) = watch::channel(Arc::default());
-    let driver = tasks.spawn(drive(config.clone(), inbox, views, stop.clone()));
+    let (views, view) = watch::channel(Arc::default());
+    let line = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
+    // First, so that no number of a shot is given twice.
+    if let Some(queue) = config.queue.clone() {
+        let (_queue, task) = Queue::open(queue, line.clone()).await?;
+        tasks.spawn(task.run(stop.clone()));
+    }
+    let last_shot = line.last_shot.clone();
+    let driver = tasks.spawn(drive(config.clone(), inbox, views, last_shot, stop.clone()));
     tokio::pin!(shutdown);
     let admission = Admission::new(&config, events);
     loop {
@@ -148,9 +163,41 @@ pub enum ToDriver {
 pub struct FarmLine {
     events: mpsc::Sender<ToDriver>,
     view: watch::Receiver<Arc<FarmView>>,
+    last_shot: Arc<AtomicU64>,
 }
 
+/// Messages that may wait for a client inside this process, on each lane.
+const INSIDE_QUEUE: usize = 4096;
+
 impl FarmLine {
+    /// Opens a client inside this process: what the farm says to it comes out of the end,
+    /// which closes when the farm gives the client up.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn join(&self, client: ClientId, name: &str) -> Result<OutboxEnd, OrderError> {
+        let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
+        let greeting = Greeting { name: name.to_owned(), threads: 0 };
+        let traits = peer::PeerTraits { greeting, loopback: true };
+        let open = ToDriver::Open(Peer::Client(client), outbox, CancellationToken::new(), traits);
+        self.events.send(open).await.map_err(|_| OrderError::Stopping)?;
+        Ok(end)
+    }
+
+    /// Passes on what such a client says.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn tell(&self, client: ClientId, event: PeerEvent) -> Result<(), OrderError> {
+        let event = ToDriver::Event(Peer::Client(client), event);
+        self.events.send(event).await.map_err(|_| OrderError::Stopping)
+    }
+
+    /// The counter of all shots.
+    pub fn last_shot(&self) -> &AtomicU64 {
+        &self.last_shot
+    }
+
     /// Has an order carried out and waits for what came of it.
     ///
     /// # Errors
@@ -179,11 +226,13 @@ async fn drive(
     config: Config,
     mut inbox: mpsc::Receiver<ToDriver>,
     views: watch::Sender<Arc<FarmView>>,
+    last_shot: Arc<AtomicU64>,
     stop: CancellationToken,
 ) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
-    let mut farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let mut farm = farm.counted_by(last_shot);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     let mut looks = tokio::time::interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);

@@ -132,7 +132,7 @@ fn view_shot(id: ShotId, state: &Shot) -> ShotView {
         state: ShotState::Running,
         note: String::new(),
         priority: state.submit.priority,
-        queued: false,
+        queued: state.queued,
         first_frame: 0,
         frames: state.submit.frames,
         frames_done: state.frames_done,
