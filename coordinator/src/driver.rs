@@ -6,7 +6,7 @@
 
 use crate::api::{self, Desk, Web};
 use crate::blobs::ClientId;
-use crate::farm::{Farm, Out, Peer, PeerEvent};
+use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
 use crate::queue::{Queue, QueueConfig, QueueError};
@@ -16,10 +16,11 @@ use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
+use terrafarm_wire::link::{self, Outbox, OutboxEnd, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -57,6 +58,8 @@ pub struct Config {
     pub seed: u64,
     /// Settings of the scheduler; heartbeat and silence are told to the workers.
     pub scheduler: terrafarm_sched::Config,
+    /// The queue on disk, if there is to be one.
+    pub queue: Option<QueueConfig>,
 }
 
 impl Default for Config {
@@ -70,6 +73,7 @@ impl Default for Config {
             greeting_limit: Duration::from_secs(5),
             seed: 1,
             scheduler: terrafarm_sched::Config::default(),
+            queue: None,
         }
     }
 }
@@ -86,42 +90,33 @@ pub enum CoordinatorError {
          strangers; give one, or say --plain on a network you trust"
     )]
     NoToken(SocketAddr),
-    /// Its queue on disk cannot be used.
+    /// The queue on disk cannot be used.
     #[error(transparent)]
     Queue(#[from] QueueError),
-}
-
-/// What a coordinator may have beside its farm.
-#[derive(Default)]
-pub struct Office {
-    /// Shots that outlive whoever submitted them.
-    pub queue: Option<QueueConfig>,
-    /// The API by HTTP, and the page.
-    pub web: Option<Web>,
 }
 
 /// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
 /// function returns when every connection has ended.
 ///
 /// # Errors
-/// If the socket cannot be used at all; refused connections and lost peers are normal
+/// If the socket or the queue on disk cannot be used at all; refused connections and lost peers are normal
 /// work and only logged.
 pub async fn run(
     config: Config,
     listener: TcpListener,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
-    run_office(config, listener, Office::default(), shutdown).await
+    run_with_page(config, listener, None, shutdown).await
 }
 
-/// As [`run`], with a queue and a page.
+/// As [`run`], with the API by HTTP and the page.
 ///
 /// # Errors
-/// As [`run`], and if the queue cannot be opened.
-pub async fn run_office(
+/// As [`run`].
+pub async fn run_with_page(
     config: Config,
     listener: TcpListener,
-    office: Office,
+    web: Option<Web>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
     let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
@@ -132,19 +127,22 @@ pub async fn run_office(
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
     let (views, view) = watch::channel(Arc::default());
-    let thumbnails = Arc::<Thumbnails>::default();
-    let driver = tasks.spawn(drive(config.clone(), inbox, views, thumbnails.clone(), stop.clone()));
-    let farm = FarmLine { events: events.clone(), view };
-    let queue = match office.queue {
-        Some(config) => {
-            let (queue, task) = Queue::open(config, farm.clone()).await?;
+    let farm = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
+    // First, so that no number of a shot is given twice.
+    let queue = match config.queue.clone() {
+        Some(queue) => {
+            let (queue, task) = Queue::open(queue, farm.clone()).await?;
             tasks.spawn(task.run(stop.clone()));
             Some(queue)
         }
         None => None,
     };
+    let thumbnails = Arc::<Thumbnails>::default();
+    let sight = Sight { views, thumbnails: thumbnails.clone() };
+    let last_shot = farm.last_shot.clone();
+    let driver = tasks.spawn(drive(config.clone(), inbox, sight, last_shot, stop.clone()));
     let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
-    if let Some(web) = office.web {
+    if let Some(web) = web {
         tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
     }
     tokio::pin!(shutdown);
@@ -190,9 +188,41 @@ pub enum ToDriver {
 pub struct FarmLine {
     events: mpsc::Sender<ToDriver>,
     view: watch::Receiver<Arc<FarmView>>,
+    last_shot: Arc<AtomicU64>,
 }
 
+/// Messages that may wait for a client inside this process, on each lane.
+const INSIDE_QUEUE: usize = 4096;
+
 impl FarmLine {
+    /// Opens a client inside this process: what the farm says to it comes out of the end,
+    /// which closes when the farm gives the client up.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn join(&self, client: ClientId, name: &str) -> Result<OutboxEnd, OrderError> {
+        let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
+        let greeting = Greeting { name: name.to_owned(), threads: 0 };
+        let traits = peer::PeerTraits { greeting, loopback: true };
+        let open = ToDriver::Open(Peer::Client(client), outbox, CancellationToken::new(), traits);
+        self.events.send(open).await.map_err(|_| OrderError::Stopping)?;
+        Ok(end)
+    }
+
+    /// Passes on what such a client says.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn tell(&self, client: ClientId, event: PeerEvent) -> Result<(), OrderError> {
+        let event = ToDriver::Event(Peer::Client(client), event);
+        self.events.send(event).await.map_err(|_| OrderError::Stopping)
+    }
+
+    /// The counter of all shots.
+    pub fn last_shot(&self) -> &AtomicU64 {
+        &self.last_shot
+    }
+
     /// Has an order carried out and waits for what came of it.
     ///
     /// # Errors
@@ -217,16 +247,23 @@ struct Line {
     loopback: bool,
 }
 
+/// Where the driver puts what is to be seen.
+struct Sight {
+    views: watch::Sender<Arc<FarmView>>,
+    thumbnails: Arc<Thumbnails>,
+}
+
 async fn drive(
     config: Config,
     mut inbox: mpsc::Receiver<ToDriver>,
-    views: watch::Sender<Arc<FarmView>>,
-    thumbnails: Arc<Thumbnails>,
+    sight: Sight,
+    last_shot: Arc<AtomicU64>,
     stop: CancellationToken,
 ) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
-    let mut farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let mut farm = farm.counted_by(last_shot);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     let mut looks = tokio::time::interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -254,14 +291,14 @@ async fn drive(
                 None => break,
             },
             _ = looks.tick() => {
-                views.send_if_modified(|view| {
+                sight.views.send_if_modified(|view| {
                     *view = Arc::new(farm.view(now(), wall_s()));
                     true
                 });
             }
         }
         while let Some(out) = farm.poll_out() {
-            if let Some((peer, why)) = carry(out, &mut lines, &thumbnails) {
+            if let Some((peer, why)) = carry(out, &mut lines, &sight.thumbnails) {
                 farm.handle(now(), peer, PeerEvent::Gone(LostReason::Broken, why));
             }
         }

@@ -8,8 +8,10 @@ mod desk;
 mod tally;
 
 use crate::blobs::{Broker, ClientId, Order};
-use crate::shots::{FrameHead, Granted, Shots};
+use crate::shots::{Adoption, FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
@@ -40,6 +42,8 @@ pub enum PeerEvent {
     Joined(Greeting),
     /// A message came.
     Said(Message),
+    /// The queue on disk submits a shot.
+    Adopt(Box<Adoption>),
     /// The connection has ended; why, in words.
     Gone(LostReason, String),
 }
@@ -105,6 +109,12 @@ impl Farm {
         }
     }
 
+    /// Numbers shots with a counter that the queue on disk shares.
+    pub fn counted_by(mut self, last_shot: Arc<AtomicU64>) -> Self {
+        self.shots = Shots::counted_by(last_shot);
+        self
+    }
+
     /// What to do next; `None` when all is said. Call until then after every other call.
     pub fn poll_out(&mut self) -> Option<Out> {
         self.out.pop_front()
@@ -155,7 +165,7 @@ impl Farm {
                 self.hear_worker(now, worker, message);
             }
             // It has been dropped; what was still on its way does not count.
-            PeerEvent::Said(_) => {}
+            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -210,7 +220,10 @@ impl Farm {
             PeerEvent::Said(message) if self.clients.contains_key(&client) => {
                 self.hear_client(now, client, message);
             }
-            PeerEvent::Said(_) => {}
+            PeerEvent::Adopt(adoption) if self.clients.contains_key(&client) => {
+                self.adopt(now, client, *adoption);
+            }
+            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -268,6 +281,20 @@ impl Farm {
             }
             Message::Goodbye(_) => {}
             other => self.misbehaved(now, Peer::Client(client), &other),
+        }
+    }
+
+    fn adopt(&mut self, now: Micros, client: ClientId, adoption: Adoption) {
+        let number = adoption.submit.number;
+        match self.shots.adopt(client, adoption, now) {
+            Ok((accepted, event)) => {
+                self.send(Peer::Client(client), accepted);
+                self.schedule(now, event);
+            }
+            Err(why) => {
+                let reason = clip_reason(&why);
+                self.send(Peer::Client(client), Rejected { number, reason });
+            }
         }
     }
 

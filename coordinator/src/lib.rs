@@ -21,4 +21,4 @@ mod strangers;
 mod thumbnails;
 pub mod view;
 
-pub use driver::{Config, CoordinatorError, Office, run, run_office};
+pub use driver::{Config, CoordinatorError, run, run_with_page};

@@ -21,7 +21,10 @@
 //! frames and films, `task` joins them.
 
 mod blobs;
+mod book;
 mod disk;
+mod ledger;
+mod pictures;
 mod plan;
 mod task;
 
@@ -309,7 +312,15 @@ impl Queue {
     /// # Errors
     /// If it cannot be rendered, some of its terrain is not here, or there is no room.
     pub async fn submit(&self, plan: ShotPlan) -> Result<ShotId, QueueError> {
-        self.ask(|answer| Command::Submit(Box::new(plan), answer)).await
+        let blobs = self.blobs.clone();
+        let plan = blocking(move || {
+            plan.check()?;
+            blobs.has_room()?;
+            blobs.complete(plan.index)?;
+            Ok(plan)
+        });
+        let plan = Box::new(plan.await?);
+        self.ask(|answer| Command::Submit(plan, answer)).await
     }
 
     /// Carries out an order about a shot of the queue: pause, resume, cancel, priority,

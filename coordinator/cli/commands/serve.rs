@@ -7,9 +7,9 @@ use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
+use terrafarm_coordinator::Config;
 use terrafarm_coordinator::api::{Access, Web, WebKey};
 use terrafarm_coordinator::queue::QueueConfig;
-use terrafarm_coordinator::{Config, Office};
 use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::{Reconnect, WorkerConfig};
 use tokio::net::TcpListener;
@@ -37,13 +37,12 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             trust,
+            queue: args.data.as_deref().map(QueueConfig::new),
             ..Config::default()
         };
         let stop = stop_signal();
         notify::ready(&format!("listening on {address}"));
-        let queue = args.data.as_deref().map(QueueConfig::new);
-        let office = Office { queue, web };
-        terrafarm_coordinator::run_office(config, listener, office, told(stop)).await?;
+        terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
         Ok(Outcome::Done)
     })
 }

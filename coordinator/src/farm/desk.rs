@@ -164,7 +164,7 @@ impl Farm {
             state: if is_paused { ShotState::Paused } else { ShotState::Running },
             note: String::new(),
             priority: self.scheduler.priority(id).unwrap_or(submit.priority),
-            queued: false,
+            queued: shot.queued,
             first_frame: 0,
             frames: submit.frames,
             frames_done: shot.frames_done,

@@ -56,6 +56,14 @@ impl Blobs {
         disk::error(&self.config.folder, what, path, why)
     }
 
+    /// Fails if the disk has no more than the reserve.
+    ///
+    /// # Errors
+    /// [`QueueError::DiskFull`].
+    pub fn has_room(&self) -> Result<(), QueueError> {
+        disk::has_room(&self.config.folder, self.config.reserve_bytes, 0)
+    }
+
     /// Those that are not here; the others stay for the time of grace from now on.
     pub fn missing(&self, hashes: Vec<BlobHash>) -> Vec<BlobHash> {
         let now = SystemTime::now();
