@@ -79,6 +79,8 @@ pub(crate) struct Worker {
     pub(crate) yields_at: Option<Micros>,
     /// Wants to leave.
     pub(crate) is_draining: bool,
+    /// Was at fault in an audit: gets nothing.
+    pub(crate) is_distrusted: bool,
     /// Let a lease expire and has done nothing since: gets one job at a time.
     pub(crate) is_suspect: bool,
     /// When the last byte came.
@@ -100,10 +102,16 @@ impl Worker {
             head_deadline: None,
             yields_at: None,
             is_draining: false,
+            is_distrusted: false,
             is_suspect: false,
             heard_at: now,
             hunger: None,
         }
+    }
+
+    /// Whether it may get jobs.
+    pub(crate) fn is_active(&self) -> bool {
+        !self.is_draining && !self.is_distrusted
     }
 
     /// Expected time for a cost, microseconds.
