@@ -323,6 +323,10 @@ pub struct Coordinator {
     /// Memory for terrain tiles on their way to workers, MiB
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
     pub blob_memory: u64,
+    /// Render this share of the jobs a second time, by another worker, and compare: one that
+    /// differs from two others gets no more jobs and is reported. Costs as much of the farm
+    #[arg(long, value_name = "PERCENT", default_value = "0")]
+    pub audit: Share,
 }
 
 /// `terrafarm worker`

@@ -5,10 +5,12 @@
 //! driver task (`driver.rs`) owns it and carries the messages.
 
 mod desk;
+mod trust;
 
 use crate::blobs::{Broker, ClientId, Order};
 use crate::shots::{FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
@@ -76,6 +78,7 @@ pub struct Farm {
     granted: BTreeMap<LeaseId, Granted>,
     out: VecDeque<Out>,
     pings: u64,
+    trust: trust::Trust,
 }
 
 #[derive(Debug)]
@@ -89,6 +92,7 @@ struct WorkerState {
 impl Farm {
     /// A farm without peers.
     pub fn new(scheduler: terrafarm_sched::Config, seed: u64, blob_memory_bytes: usize) -> Self {
+        let is_auditing = scheduler.audit != Share::NONE;
         Farm {
             scheduler: Scheduler::new(scheduler, seed),
             broker: Broker::new(blob_memory_bytes),
@@ -98,6 +102,7 @@ impl Farm {
             granted: BTreeMap::new(),
             out: VecDeque::new(),
             pings: 0,
+            trust: trust::Trust::new(is_auditing),
         }
     }
 
@@ -129,10 +134,14 @@ impl Farm {
             PeerEvent::Joined(greeting) => {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
+                let is_distrusted = self.trust.is_distrusted(&greeting.name);
                 let state =
                     WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
                 self.workers.insert(worker, state);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
+                if is_distrusted {
+                    self.schedule(now, Event::WorkerDistrusted { worker });
+                }
             }
             PeerEvent::Gone(why, how) => {
                 let held = self.workers.get(&worker).map_or(0, |state| state.leases.len());
@@ -321,7 +330,8 @@ impl Farm {
             None => None,
         };
         let cost_us = done.report.cost_us;
-        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us });
+        let digest = pixels.as_deref().map_or(0, |pixels| self.trust.digest(pixels));
+        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us, digest });
         let verdict = self.scheduler.poll_action();
         match (verdict, pixels) {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
@@ -333,6 +343,10 @@ impl Farm {
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
                     tracing::error!(%shot, "cannot merge pixels: {why}");
                 }
+            }
+            (Some(Action::Compared { agrees, .. }), _) => {
+                let shot = granted.map(|granted| granted.shot);
+                self.count_audit(now, worker, shot, agrees, &done.timesheet);
             }
             (Some(Action::Refuse { why, .. }), _) => {
                 tracing::info!(%worker, %lease, ?why, "late result refused");
@@ -374,6 +388,17 @@ impl Farm {
             match action {
                 Action::Grant { worker, lease, shot, frame, region } => {
                     self.grant(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Audit { worker, lease, shot, frame, region, .. } => {
+                    self.send_job(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Retract { shot, frame, region, .. } => {
+                    self.shots.retract(shot, frame, region);
+                }
+                Action::Distrusted { worker, why, sent } => self.distrust(worker, &why, &sent),
+                Action::Trusted { worker } => self.trust_again(worker),
+                Action::Disputed { shot, frame, region, workers } => {
+                    self.report_dispute(shot, frame, region, &workers);
                 }
                 Action::Revoke { worker, lease } => {
                     self.end_lease(worker, lease);
@@ -418,7 +443,7 @@ impl Farm {
                 Action::Unblocked { worker, shot } => {
                     tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
                 }
-                Action::Accept { .. } | Action::Refuse { .. } => {
+                Action::Accept { .. } | Action::Compared { .. } | Action::Refuse { .. } => {
                     tracing::error!(?action, "a verdict without a result");
                 }
             }
@@ -426,9 +451,19 @@ impl Farm {
     }
 
     fn grant(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
+        let Granted { worker, shot, frame, .. } = granted;
+        if self.shots.begin_frame(shot, frame, now).is_none() {
+            tracing::error!(%shot, %worker, "a job for nobody");
+            return;
+        }
+        self.send_job(now, granted, lease);
+    }
+
+    /// Sends a job to its worker, which is told of the shot first.
+    fn send_job(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
         let Granted { worker, shot, frame, region } = granted;
         let (Some(state), Some(worker_state)) =
-            (self.shots.begin_frame(shot, frame, now), self.workers.get_mut(&worker))
+            (self.shots.get(shot), self.workers.get_mut(&worker))
         else {
             tracing::error!(%shot, %worker, "a job for nobody");
             return;

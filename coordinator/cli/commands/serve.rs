@@ -27,6 +27,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             trust,
+            scheduler: terrafarm_sched::Config { audit: args.audit, ..Default::default() },
             ..Config::default()
         };
         let stop = stop_signal();
