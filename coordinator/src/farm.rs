@@ -185,6 +185,10 @@ impl Farm {
                 self.schedule(now, Event::WorkerDraining { worker });
                 self.schedule(now, Event::HandedBack { worker, leases: back.leases });
             }
+            Message::Speed(speed) => {
+                let pixels_per_s = speed.pixels_per_s;
+                self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
+            }
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
             Message::Goodbye(goodbye) => {
                 tracing::debug!(%worker, "says goodbye: {}", goodbye.reason);

@@ -29,8 +29,17 @@ pub enum Event {
     WorkerJoined {
         /// A connection that has not been used before.
         worker: WorkerId,
-        /// Threads it renders with: the first guess of its speed.
+        /// Threads it renders with: the first guess of its speed, until
+        /// [`Event::WorkerMeasured`].
         threads: u32,
+    },
+    /// When a worker has said how fast it rendered something that is the same for all: a
+    /// better first guess than its threads. Changes nothing after its first job.
+    WorkerMeasured {
+        /// The worker.
+        worker: WorkerId,
+        /// Pixels in a second; only compared with those of others.
+        pixels_per_s: u64,
     },
     /// When a connection has ended. What the worker held is granted anew at once.
     WorkerLost {

@@ -115,6 +115,10 @@ impl Scheduler {
         );
         match event {
             Event::WorkerJoined { worker, threads } => self.join(worker, threads),
+            Event::WorkerMeasured { worker, pixels_per_s } => {
+                self.hear(worker);
+                self.measure(worker, pixels_per_s);
+            }
             Event::WorkerLost { worker, why: _ } => self.forget_worker(worker),
             Event::WorkerDraining { worker } => {
                 self.hear(worker);
@@ -224,6 +228,31 @@ impl Scheduler {
         let beat_at = self.now.after(self.config.heartbeat_us - spread);
         self.timers.insert((beat_at, Timer::Beat(worker)));
         self.refresh_hunger(worker);
+    }
+
+    /// Guesses the speed of a new worker: it is to that of the others as its measurement is
+    /// to theirs. The median, so that one odd measurement does not spoil all guesses.
+    fn measure(&mut self, worker: WorkerId, pixels_per_s: u64) {
+        let measured = pixels_per_s.max(1) as f64;
+        let others = self.workers.iter().filter(|&(&id, known)| id != worker && known.is_active());
+        let mut ratios: Vec<f64> =
+            others.filter_map(|(_, known)| Some(known.speed.value() / known.measured?)).collect();
+        ratios.sort_unstable_by(f64::total_cmp);
+        let average = self.active_speed / self.active_threads.max(1) as f64;
+        let Some(known) = self.workers.get_mut(&worker).filter(|known| known.measured.is_none())
+        else {
+            return;
+        };
+        known.measured = Some(measured);
+        if let Some(ratio) = ratios.get(ratios.len() / 2) {
+            let before = known.speed.value();
+            known.guess(ratio * measured, average);
+            let change = known.speed.value() - before;
+            if known.is_active() {
+                self.active_speed += change;
+            }
+            self.refresh_hunger(worker);
+        }
     }
 
     fn hear(&mut self, worker: WorkerId) {

@@ -533,6 +533,9 @@ fn any_event() -> impl Strategy<Value = Event> {
         1 => (shot(), -1i32..2).prop_map(|(shot, priority)| Event::ShotPrioritised { shot, priority }),
         1 => (worker(), prop::option::of(shot())).prop_map(|(worker, shot)| Event::WorkerCleared { worker, shot }),
         1 => worker().prop_map(|worker| Event::WorkerDistrusted { worker }),
+        1 => (worker(), any::<u64>()).prop_map(|(worker, pixels_per_s)| {
+            Event::WorkerMeasured { worker, pixels_per_s }
+        }),
         2 => worker().prop_map(|worker| Event::HeardFrom { worker }),
         2 => Just(Event::Tick),
     ]

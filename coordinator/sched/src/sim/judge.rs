@@ -124,6 +124,7 @@ impl Judge {
             | Event::ShotResumed { .. }
             | Event::ShotPrioritised { .. }
             | Event::WorkerDistrusted { .. }
+            | Event::WorkerMeasured { .. }
             | Event::HeardFrom { .. }
             | Event::Tick => {}
         }
