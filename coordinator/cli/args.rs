@@ -356,6 +356,10 @@ pub struct Coordinator {
     /// The page and the API by HTTP
     #[command(flatten)]
     pub web: queue::Web,
+    /// Render this share of the jobs a second time, by another worker, and compare: one that
+    /// differs from two others gets no more jobs and is reported. Costs as much of the farm
+    #[arg(long, value_name = "PERCENT", default_value = "0")]
+    pub audit: Share,
 }
 
 /// `terrafarm worker`

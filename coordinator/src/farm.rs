@@ -6,12 +6,14 @@
 
 mod desk;
 mod tally;
+mod trust;
 
 use crate::blobs::{Broker, ClientId, Order};
 use crate::shots::{Adoption, FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
@@ -83,6 +85,7 @@ pub struct Farm {
     pings: u64,
     /// For those who look at the farm.
     tally: tally::Tally,
+    trust: trust::Trust,
 }
 
 #[derive(Debug)]
@@ -96,6 +99,7 @@ struct WorkerState {
 impl Farm {
     /// A farm without peers.
     pub fn new(scheduler: terrafarm_sched::Config, seed: u64, blob_memory_bytes: usize) -> Self {
+        let is_auditing = scheduler.audit != Share::NONE;
         Farm {
             scheduler: Scheduler::new(scheduler, seed),
             broker: Broker::new(blob_memory_bytes),
@@ -106,6 +110,7 @@ impl Farm {
             out: VecDeque::new(),
             pings: 0,
             tally: tally::Tally::default(),
+            trust: trust::Trust::new(is_auditing),
         }
     }
 
@@ -143,11 +148,15 @@ impl Farm {
             PeerEvent::Joined(greeting) => {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
+                let is_distrusted = self.trust.is_distrusted(&greeting.name);
                 let state =
                     WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
                 self.workers.insert(worker, state);
                 self.tally.joined(worker, now);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
+                if is_distrusted {
+                    self.schedule(now, Event::WorkerDistrusted { worker });
+                }
             }
             PeerEvent::Gone(why, how) => {
                 let held = self.workers.get(&worker).map_or(0, |state| state.leases.len());
@@ -191,6 +200,10 @@ impl Farm {
                 }
                 self.schedule(now, Event::WorkerDraining { worker });
                 self.schedule(now, Event::HandedBack { worker, leases: back.leases });
+            }
+            Message::Speed(speed) => {
+                let pixels_per_s = speed.pixels_per_s;
+                self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
             }
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
             Message::Goodbye(goodbye) => {
@@ -355,7 +368,8 @@ impl Farm {
             None => None,
         };
         let cost_us = done.report.cost_us;
-        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us });
+        let digest = pixels.as_deref().map_or(0, |pixels| self.trust.digest(pixels));
+        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us, digest });
         let verdict = self.scheduler.poll_action();
         match (verdict, pixels) {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
@@ -368,6 +382,10 @@ impl Farm {
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
                     tracing::error!(%shot, "cannot merge pixels: {why}");
                 }
+            }
+            (Some(Action::Compared { agrees, .. }), _) => {
+                let shot = granted.map(|granted| granted.shot);
+                self.count_audit(now, worker, shot, agrees, &done.timesheet);
             }
             (Some(Action::Refuse { why, .. }), _) => {
                 tracing::info!(%worker, %lease, ?why, "late result refused");
@@ -410,6 +428,17 @@ impl Farm {
             match action {
                 Action::Grant { worker, lease, shot, frame, region } => {
                     self.grant(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Audit { worker, lease, shot, frame, region, .. } => {
+                    self.send_job(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Retract { shot, frame, region, .. } => {
+                    self.shots.retract(shot, frame, region);
+                }
+                Action::Distrusted { worker, why, sent } => self.distrust(worker, &why, &sent),
+                Action::Trusted { worker } => self.trust_again(worker),
+                Action::Disputed { shot, frame, region, workers } => {
+                    self.report_dispute(shot, frame, region, &workers);
                 }
                 Action::Revoke { worker, lease } => {
                     self.end_lease(worker, lease);
@@ -456,7 +485,7 @@ impl Farm {
                     self.tally.blocked(worker, shot, false);
                     tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
                 }
-                Action::Accept { .. } | Action::Refuse { .. } => {
+                Action::Accept { .. } | Action::Compared { .. } | Action::Refuse { .. } => {
                     tracing::error!(?action, "a verdict without a result");
                 }
             }
@@ -464,9 +493,19 @@ impl Farm {
     }
 
     fn grant(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
+        let Granted { worker, shot, frame, .. } = granted;
+        if self.shots.begin_frame(shot, frame, now).is_none() {
+            tracing::error!(%shot, %worker, "a job for nobody");
+            return;
+        }
+        self.send_job(now, granted, lease);
+    }
+
+    /// Sends a job to its worker, which is told of the shot first.
+    fn send_job(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
         let Granted { worker, shot, frame, region } = granted;
         let (Some(state), Some(worker_state)) =
-            (self.shots.begin_frame(shot, frame, now), self.workers.get_mut(&worker))
+            (self.shots.get(shot), self.workers.get_mut(&worker))
         else {
             tracing::error!(%shot, %worker, "a job for nobody");
             return;

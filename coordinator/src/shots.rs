@@ -367,6 +367,14 @@ impl Shots {
         Ok(())
     }
 
+    /// Forgets pixels that were merged into an open frame; they will come again.
+    pub fn retract(&mut self, shot: ShotId, frame: FrameIndex, region: Region) {
+        let Some(state) = self.shots.get_mut(&shot) else { return };
+        if !state.film.retract(frame, region) {
+            tracing::error!(%shot, frame, ?region, "pixels to take back that are not there");
+        }
+    }
+
     /// A frame is complete: its message (still without pixels) and its picture.
     pub fn finish_frame(
         &mut self,

@@ -4,7 +4,7 @@
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
 //! the session asks for over one connection; `backoff` says when to try again, `clock` where the
-//! time goes. A [`sleeper`]
+//! time goes, `trial` how fast this PC is. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
@@ -19,6 +19,7 @@ pub mod session;
 mod shift;
 pub mod sleeper;
 pub mod terrain;
+mod trial;
 
 pub use backoff::Reconnect;
 pub use render::{Caster, RayCaster};
@@ -26,6 +27,7 @@ pub use render::{Caster, RayCaster};
 use backoff::Backoff;
 use shift::{Shift, Site};
 use std::net::SocketAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -35,7 +37,7 @@ use terrafarm_wire::message::{Hello, Role, Welcome};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 
 /// How long connecting may take, and the greeting after it.
 const CONNECT_LIMIT: Duration = Duration::from_secs(10);
@@ -214,7 +216,17 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
         }
     };
     let terrain = terrain::Terrain::new(config.memory_limit_bytes);
-    Ok(Site { pool, cache, terrain, caster: Arc::new(caster) })
+    let caster = Arc::new(caster);
+    let (tried, trial) = tokio::sync::oneshot::channel();
+    let on_trial = caster.clone();
+    pool.spawn(move || {
+        // A trial that panics says as much as none.
+        let speed = catch_unwind(AssertUnwindSafe(|| on_trial.trial()));
+        let _unheard = tried.send(speed.ok().flatten());
+    });
+    let pixels_per_s = trial.await.ok().flatten();
+    debug!(pixels_per_s, "tried how fast this worker is");
+    Ok(Site { pool, cache, terrain, caster, pixels_per_s })
 }
 
 type Connected = (Connection<TcpStream>, Welcome, SocketAddr);

@@ -38,6 +38,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             trust,
             queue: args.data.as_deref().map(QueueConfig::new),
+            scheduler: terrafarm_sched::Config { audit: args.audit, ..Default::default() },
             ..Config::default()
         };
         let stop = stop_signal();

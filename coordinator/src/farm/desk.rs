@@ -65,7 +65,7 @@ impl Farm {
                 if !self.workers.contains_key(&worker) {
                     return Err(OrderError::NoWorker(worker));
                 }
-                self.schedule(now, Event::WorkerCleared { worker, shot });
+                self.schedule(now, Event::WorkerCleared { worker, shot: Some(shot) });
                 Ok(format!("{worker} gets jobs of {shot} again"))
             }
             Order::Drain(worker) => {

@@ -188,6 +188,7 @@ impl<'a> World<'a> {
             self.judge.action(&action);
             match action {
                 Action::Grant { worker, .. }
+                | Action::Audit { worker, .. }
                 | Action::Revoke { worker, .. }
                 | Action::Probe { worker }
                 | Action::Drop { worker, .. } => self.send_down(worker, action),
@@ -204,7 +205,14 @@ impl<'a> World<'a> {
                     self.client(shot, |client| client.failed.insert(frame));
                 }
                 Action::ShotComplete { .. } | Action::ShotFailed { .. } => self.shots_left -= 1,
-                Action::Refuse { .. } | Action::Blocked { .. } | Action::Unblocked { .. } => {}
+                Action::Refuse { .. }
+                | Action::Compared { .. }
+                | Action::Retract { .. }
+                | Action::Distrusted { .. }
+                | Action::Trusted { .. }
+                | Action::Disputed { .. }
+                | Action::Blocked { .. }
+                | Action::Unblocked { .. } => {}
             }
         }
         self.judge.settled();
@@ -333,7 +341,9 @@ impl<'a> World<'a> {
             self.send_up(i, Event::JobFailed { worker, lease, reason }, SMALL_BYTES, false);
         } else {
             let bytes = running.job.region.area() as f64 * self.config.bytes_per_px;
-            self.send_up(i, Event::JobDone { worker, lease, cost_us }, bytes, false);
+            // Everyone renders the same.
+            let digest = 0;
+            self.send_up(i, Event::JobDone { worker, lease, cost_us, digest }, bytes, false);
         }
         if self.machines[i].is_leaving {
             self.leave(i, worker);
@@ -353,7 +363,8 @@ impl<'a> World<'a> {
             return;
         }
         match action {
-            Action::Grant { lease, shot, frame, region, .. } => {
+            Action::Grant { lease, shot, frame, region, .. }
+            | Action::Audit { lease, shot, frame, region, .. } => {
                 let running = machine.running.map(|running| running.job.lease);
                 let has_it = machine.queue.iter().any(|job| job.lease == lease);
                 if machine.is_leaving {
