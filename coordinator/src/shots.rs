@@ -217,13 +217,7 @@ impl Shots {
         Ok(())
     }
 
-    fn insert(
-        &mut self,
-        id: ShotId,
-        client: ClientId,
-        submit: Submit,
-        now: Micros,
-    ) -> &mut Shot {
+    fn insert(&mut self, id: ShotId, client: ClientId, submit: Submit, now: Micros) -> &mut Shot {
         self.film_bytes += film_bytes(&submit);
         self.cameras += u64::from(submit.frames);
         let shot = Shot {

@@ -15,9 +15,7 @@
 use super::QueueError;
 use super::plan::ShotPlan;
 use crate::sink::manifest::{FrameEntry, WorkerEntry};
-use redb::{
-    Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTransaction,
-};
+use redb::{Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTransaction};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -355,8 +353,10 @@ impl Ledger {
             let over: Result<std::collections::BTreeSet<_>, _> =
                 frames.range(all.clone())?.map(|row| row.map(|(key, _)| key.value().1)).collect();
             let cameras = transaction.open_table(CAMERAS)?;
-            let pieces: Result<Vec<_>, _> =
-                cameras.range(all)?.map(|row| row.map(|(_, piece)| piece.value().to_vec())).collect();
+            let pieces: Result<Vec<_>, _> = cameras
+                .range(all)?
+                .map(|row| row.map(|(_, piece)| piece.value().to_vec()))
+                .collect();
             Ok((over?, pieces?))
         })?;
         let cameras: Vec<_> =
@@ -448,7 +448,11 @@ impl Ledger {
         serde_json::to_vec(value).map_err(|why| self.damaged(format!("cannot be written: {why}")))
     }
 
-    fn parse<T: for<'de> Deserialize<'de>>(&self, what: &str, text: &[u8]) -> Result<T, QueueError> {
+    fn parse<T: for<'de> Deserialize<'de>>(
+        &self,
+        what: &str,
+        text: &[u8],
+    ) -> Result<T, QueueError> {
         serde_json::from_slice(text)
             .map_err(|why| self.damaged(format!("the record of {what} cannot be read: {why}")))
     }

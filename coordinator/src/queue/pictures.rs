@@ -172,12 +172,7 @@ fn put_all(
 }
 
 /// Reads a picture back; `None` if it is not the one that was rendered.
-fn read(
-    files: &ShotFiles,
-    index: FrameIndex,
-    entry: &FrameEntry,
-    size: [u32; 2],
-) -> Option<Rgb8> {
+fn read(files: &ShotFiles, index: FrameIndex, entry: &FrameEntry, size: [u32; 2]) -> Option<Rgb8> {
     let path = files.frame(files.first_frame + index)?;
     let picture = decode(&path, size)?;
     (sink::pixels_sha256(&picture).to_hex() == entry.sha256).then_some(picture)
@@ -191,7 +186,8 @@ fn decode(path: &Path, size: [u32; 2]) -> Option<Rgb8> {
     }
     let mut pixels = vec![0; reader.output_buffer_size()?];
     let facts = reader.next_frame(&mut pixels).ok()?;
-    let is_ours = facts.color_type == png::ColorType::Rgb && facts.bit_depth == png::BitDepth::Eight;
+    let is_ours =
+        facts.color_type == png::ColorType::Rgb && facts.bit_depth == png::BitDepth::Eight;
     if !is_ours {
         return None;
     }

@@ -21,11 +21,11 @@ use super::{
 };
 use crate::driver::FarmLine;
 use crate::order::{Order, OrderError};
+use stay::{Picture, Stay, StayId};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
-use stay::{Picture, Stay, StayId};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use terrafarm_wire::Message;

@@ -3,15 +3,15 @@
 #![allow(clippy::unwrap_used)]
 
 mod full;
-mod killed;
 mod house;
+mod killed;
 mod rules;
 
 use super::*;
+use crate::sink::manifest::Manifest;
 use house::{House, Land, plan, until};
 use std::fs;
 use terrafarm_common::id::WorkerId;
-use crate::sink::manifest::Manifest;
 
 fn manifest(files: &ShotFiles) -> Manifest {
     serde_json::from_slice(&fs::read(files.manifest()).unwrap()).unwrap()
@@ -143,9 +143,8 @@ async fn more_urgent_shots_come_first_and_few_are_in_the_farm() {
     let mut urgent = plan(&land, 1);
     urgent.priority = 9;
     let urgent = house.queue.submit(urgent).await.unwrap();
-    let running = |list: &ShotList| {
-        list.iter().filter(|shot| shot.state == ShotState::Running).count()
-    };
+    let running =
+        |list: &ShotList| list.iter().filter(|shot| shot.state == ShotState::Running).count();
     // The fifth is displaced, and keeps what it has begun.
     until(&house.queue, |list| list[40].state == ShotState::Running && running(list) == 6).await;
     assert_eq!(house.queue.shot(ShotId(6)).unwrap().state, ShotState::Waiting);

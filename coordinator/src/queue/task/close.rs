@@ -238,8 +238,7 @@ impl Task {
             return;
         }
         (self.is_sweeping, self.swept) = (true, Some(Instant::now()));
-        let (shared, tell, terrain) =
-            (self.shared.clone(), self.tell.clone(), self.book.terrain());
+        let (shared, tell, terrain) = (self.shared.clone(), self.tell.clone(), self.book.terrain());
         self.errands.spawn(async move {
             let swept = crate::queue::blocking(move || shared.blobs.sweep(&terrain)).await;
             let _ = tell.send(News::Swept(swept)).await;

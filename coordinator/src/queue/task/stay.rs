@@ -140,8 +140,7 @@ impl Task {
         if let Some(stay) = self.stays.get_mut(&id) {
             stay.frames = numbers;
         }
-        let (farm, blobs, tell) =
-            (self.farm.clone(), self.shared.blobs.clone(), self.tell.clone());
+        let (farm, blobs, tell) = (self.farm.clone(), self.shared.blobs.clone(), self.tell.clone());
         self.errands.spawn(attend(id, end, farm, blobs, tell));
         let adoption = Box::new(Adoption { shot, submit, cameras });
         let _ = self.farm.tell(id.client(), PeerEvent::Adopt(adoption)).await;
@@ -200,8 +199,7 @@ impl Task {
         let Some(stay) = self.stays.get_mut(&id) else { return };
         stay.seen += 1;
         let (shot, number) = (stay.shot, frame.frame);
-        let (Some(&index), Some(state)) =
-            (stay.frames.get(number as usize), self.book.get(shot))
+        let (Some(&index), Some(state)) = (stay.frames.get(number as usize), self.book.get(shot))
         else {
             return;
         };

@@ -169,8 +169,7 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
 
 fn done(grant: &Grant, number: FrameIndex) -> Done {
     let pixels = vec![number as u8; grant.region.area() as usize * 3];
-    let report =
-        RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
+    let report = RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
     let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
     let timesheet = Timesheet::default();
     Done { lease: grant.lease, report, timesheet, check: None, pixels }

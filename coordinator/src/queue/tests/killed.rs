@@ -56,7 +56,8 @@ async fn a_task_that_is_cut_off_anywhere_goes_on_where_it_was() {
         })
         .await;
         let acknowledged: u32 = house.queue.shots().iter().map(|shot| shot.frames_done).sum();
-        let again: Vec<_> = house.log().into_iter().filter(|frame| before.contains(frame)).collect();
+        let again: Vec<_> =
+            house.log().into_iter().filter(|frame| before.contains(frame)).collect();
         assert!(again.is_empty(), "round {shown} rendered {again:?} again");
         let config = house.cut_off();
         before = recorded(&config.folder);

@@ -163,9 +163,8 @@ impl Model {
         self.ledger = Ledger::open(&self.path).unwrap();
         let (last, saved) = self.ledger.load().unwrap();
         assert_eq!(last, self.last);
-        let found = saved.iter().map(|shot| {
-            (shot.id, (shot.record.stage, shot.record.plan.priority))
-        });
+        let found =
+            saved.iter().map(|shot| (shot.id, (shot.record.stage, shot.record.plan.priority)));
         assert_eq!(found.collect::<BTreeMap<_, _>>(), self.acknowledged);
         for shot in &saved {
             let of_it = self.recorded.iter().filter(|(id, _)| *id == shot.id).count();
@@ -182,9 +181,11 @@ impl Model {
                 Move::Enter(id) => {
                     let record = self.book.get(id).unwrap().record.clone();
                     let missing = self.ledger.missing(id, &record).unwrap();
-                    assert!(missing.iter().all(|(index, camera)| {
-                        camera.position.x == f64::from(*index)
-                    }));
+                    assert!(
+                        missing
+                            .iter()
+                            .all(|(index, camera)| { camera.position.x == f64::from(*index) })
+                    );
                     self.farm.insert(id, missing.into_iter().map(|(index, _)| index).collect());
                     self.book.set_present(id, true);
                 }
