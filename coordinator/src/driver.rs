@@ -4,18 +4,20 @@
 //! wait, and TCP slows the senders down. Each peer's outbox is bounded; a peer whose
 //! outbox is full does not read, and is dropped.
 
+use crate::api::{self, Desk, Web};
 use crate::blobs::ClientId;
 use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
 use crate::queue::{Queue, QueueConfig, QueueError};
+use crate::thumbnails::Thumbnails;
 use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
 use terrafarm_wire::link::{self, Outbox, OutboxEnd, Trust, is_this_pc};
@@ -104,6 +106,19 @@ pub async fn run(
     listener: TcpListener,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
+    run_with_page(config, listener, None, shutdown).await
+}
+
+/// As [`run`], with the API by HTTP and the page.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_with_page(
+    config: Config,
+    listener: TcpListener,
+    web: Option<Web>,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), CoordinatorError> {
     let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
     if matches!(config.trust, Trust::Loopback) && !is_this_pc(address.ip()) {
         return Err(CoordinatorError::NoToken(address));
@@ -112,16 +127,26 @@ pub async fn run(
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
     let (views, view) = watch::channel(Arc::default());
-    let line = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
+    let farm = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
     // First, so that no number of a shot is given twice.
-    if let Some(queue) = config.queue.clone() {
-        let (_queue, task) = Queue::open(queue, line.clone()).await?;
-        tasks.spawn(task.run(stop.clone()));
+    let queue = match config.queue.clone() {
+        Some(queue) => {
+            let (queue, task) = Queue::open(queue, farm.clone()).await?;
+            tasks.spawn(task.run(stop.clone()));
+            Some(queue)
+        }
+        None => None,
+    };
+    let thumbnails = Arc::<Thumbnails>::default();
+    let sight = Sight { views, thumbnails: thumbnails.clone() };
+    let last_shot = farm.last_shot.clone();
+    let driver = tasks.spawn(drive(config.clone(), inbox, sight, last_shot, stop.clone()));
+    let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
+    if let Some(web) = web {
+        tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
     }
-    let last_shot = line.last_shot.clone();
-    let driver = tasks.spawn(drive(config.clone(), inbox, views, last_shot, stop.clone()));
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events);
+    let admission = Admission::new(&config, events, api::router(desk), stop.clone());
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -222,10 +247,16 @@ struct Line {
     loopback: bool,
 }
 
+/// Where the driver puts what is to be seen.
+struct Sight {
+    views: watch::Sender<Arc<FarmView>>,
+    thumbnails: Arc<Thumbnails>,
+}
+
 async fn drive(
     config: Config,
     mut inbox: mpsc::Receiver<ToDriver>,
-    views: watch::Sender<Arc<FarmView>>,
+    sight: Sight,
     last_shot: Arc<AtomicU64>,
     stop: CancellationToken,
 ) {
@@ -260,14 +291,14 @@ async fn drive(
                 None => break,
             },
             _ = looks.tick() => {
-                views.send_if_modified(|view| {
-                    *view = Arc::new(farm.view(now()));
+                sight.views.send_if_modified(|view| {
+                    *view = Arc::new(farm.view(now(), wall_s()));
                     true
                 });
             }
         }
         while let Some(out) = farm.poll_out() {
-            if let Some((peer, why)) = carry(out, &mut lines) {
+            if let Some((peer, why)) = carry(out, &mut lines, &sight.thumbnails) {
                 farm.handle(now(), peer, PeerEvent::Gone(LostReason::Broken, why));
             }
         }
@@ -278,6 +309,11 @@ async fn drive(
     }
 }
 
+/// Seconds since 1970 began.
+fn wall_s() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
 async fn sleep_until(due: Option<Instant>) {
     match due {
         Some(due) => tokio::time::sleep_until(due.into()).await,
@@ -286,7 +322,11 @@ async fn sleep_until(due: Option<Instant>) {
 }
 
 /// Carries out one order. Returns a peer that has to be given up, and why.
-fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
+fn carry(
+    out: Out,
+    lines: &mut HashMap<Peer, Line>,
+    thumbnails: &Arc<Thumbnails>,
+) -> Option<(Peer, String)> {
     match out {
         Out::Send(peer, message) => {
             let line = lines.get(&peer)?;
@@ -301,8 +341,11 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
             let line = lines.get(&peer)?;
             let (outbox, hang_up) = (line.outbox.clone(), line.hang_up.clone());
             let loopback = line.loopback;
+            let thumbnails = thumbnails.clone();
             // At most as many at once as frames may be in flight.
             tokio::task::spawn_blocking(move || {
+                let (shot, frame) = head.place();
+                thumbnails.keep(shot, frame, &picture);
                 let pixels = picture.into_pixels().into();
                 let packed =
                     if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };

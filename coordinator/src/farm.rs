@@ -5,6 +5,7 @@
 //! driver task (`driver.rs`) owns it and carries the messages.
 
 mod desk;
+mod tally;
 
 use crate::blobs::{Broker, ClientId, Order};
 use crate::shots::{Adoption, FrameHead, Granted, Shots};
@@ -80,6 +81,8 @@ pub struct Farm {
     granted: BTreeMap<LeaseId, Granted>,
     out: VecDeque<Out>,
     pings: u64,
+    /// For those who look at the farm.
+    tally: tally::Tally,
 }
 
 #[derive(Debug)]
@@ -102,6 +105,7 @@ impl Farm {
             granted: BTreeMap::new(),
             out: VecDeque::new(),
             pings: 0,
+            tally: tally::Tally::default(),
         }
     }
 
@@ -142,11 +146,12 @@ impl Farm {
                 let state =
                     WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
                 self.workers.insert(worker, state);
+                self.tally.joined(worker, now);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
             }
             PeerEvent::Gone(why, how) => {
                 let held = self.workers.get(&worker).map_or(0, |state| state.leases.len());
-                if let Some(name) = self.forget_worker(worker) {
+                if let Some(name) = self.forget_worker(now, worker) {
                     match why {
                         LostReason::Left => tracing::info!(%worker, %name, "worker left: {how}"),
                         // Nobody waits for it: no reason to alarm anyone.
@@ -176,6 +181,7 @@ impl Farm {
                 let lease = failed.lease;
                 tracing::warn!(%worker, %lease, "job failed: {}", failed.reason);
                 self.end_lease(worker, lease);
+                self.tally.job_failed(worker);
                 let reason = failed.reason;
                 self.schedule(now, Event::JobFailed { worker, lease, reason });
             }
@@ -338,6 +344,7 @@ impl Farm {
                     Ok(pixels) => Some(pixels),
                     Err(why) => {
                         self.end_lease(worker, lease);
+                        self.tally.job_failed(worker);
                         let reason = format!("unusable result: {why}");
                         self.schedule(now, Event::JobFailed { worker, lease, reason });
                         return;
@@ -355,6 +362,7 @@ impl Farm {
                 let name =
                     self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
                 self.shots.count_time(shot, name, &done.timesheet, now);
+                self.tally.job_done(worker, &done.timesheet);
                 let (report, check) = (&done.report, done.check.as_ref());
                 self.shots.count_job(shot, frame, name, report, check);
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
@@ -382,6 +390,7 @@ impl Farm {
         shot: Option<ShotId>,
         sheet: &Timesheet,
     ) {
+        self.tally.wasted(worker, &sheet.wasted());
         let Some(state) = self.workers.get(&worker) else { return };
         let mut opened = state.opened.iter().copied();
         let only = opened.next().filter(|_| opened.next().is_none());
@@ -435,14 +444,16 @@ impl Farm {
                     self.send(Peer::Worker(worker), Ping { number });
                 }
                 Action::Drop { worker, why } => {
-                    let name = self.forget_worker(worker).unwrap_or_default();
+                    let name = self.forget_worker(now, worker).unwrap_or_default();
                     tracing::warn!(%worker, %name, "worker dropped: {why}");
                     self.out.push_back(Out::Close(Peer::Worker(worker), why.to_string()));
                 }
                 Action::Blocked { worker, shot } => {
+                    self.tally.blocked(worker, shot, true);
                     tracing::warn!(%worker, %shot, "worker failed too often and gets no more of this shot");
                 }
                 Action::Unblocked { worker, shot } => {
+                    self.tally.blocked(worker, shot, false);
                     tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
                 }
                 Action::Accept { .. } | Action::Refuse { .. } => {
@@ -485,6 +496,7 @@ impl Farm {
     }
 
     fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {
+        self.tally.frame_done(shot, frame, now);
         match self.shots.finish_frame(shot, frame, now) {
             Some((client, head, picture)) => {
                 self.out.push_back(Out::SendFrame(client, head, picture));
@@ -517,8 +529,9 @@ impl Farm {
     }
 
     /// Returns the worker's name if it was known.
-    fn forget_worker(&mut self, worker: WorkerId) -> Option<String> {
+    fn forget_worker(&mut self, now: Micros, worker: WorkerId) -> Option<String> {
         self.broker.worker_gone(worker);
+        self.tally.left(worker, now);
         let state = self.workers.remove(&worker)?;
         for lease in &state.leases {
             self.granted.remove(lease);
@@ -527,6 +540,7 @@ impl Farm {
     }
 
     fn forget_shot(&mut self, shot: ShotId) {
+        self.tally.forget_shot(shot);
         if self.shots.remove(shot).is_none() {
             return;
         }

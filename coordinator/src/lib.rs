@@ -6,6 +6,8 @@
 //! the other side: it submits a shot, supplies terrain, and takes frames. [`sink`] writes
 //! frames to files.
 
+pub mod api;
+pub mod ask;
 mod blobs;
 pub mod client;
 mod driver;
@@ -16,6 +18,7 @@ pub mod queue;
 mod shots;
 pub mod sink;
 mod strangers;
+mod thumbnails;
 pub mod view;
 
-pub use driver::{Config, CoordinatorError, run};
+pub use driver::{Config, CoordinatorError, run, run_with_page};

@@ -434,6 +434,11 @@ pub struct FrameHead {
 }
 
 impl FrameHead {
+    /// Which frame of which shot.
+    pub fn place(&self) -> (ShotId, FrameIndex) {
+        (self.shot, self.frame)
+    }
+
     /// The message with its pixels.
     pub fn with(self, pixels: terrafarm_wire::pixels::Pixels) -> Frame {
         let FrameHead { shot, frame, jobs, report, check, elapsed_us } = self;

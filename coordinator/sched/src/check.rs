@@ -65,6 +65,9 @@ impl Scheduler {
             ensure(worker.head_deadline.is_some() == (held > 0), || {
                 format!("{id} holds {held} jobs and its timer does not agree")
             })?;
+            ensure(worker.yields_at.is_none() || held > 0, || {
+                format!("{id} is to make way and holds nothing")
+            })?;
         }
         let hungry = self.workers.values().filter(|worker| worker.hunger.is_some()).count();
         ensure(hungry == self.hungry.len(), || "someone gone is hungry".into())

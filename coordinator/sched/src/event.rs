@@ -64,7 +64,8 @@ pub enum Event {
         height: u32,
         /// The shape of its jobs.
         split: Split,
-        /// Shots of a higher priority get every worker they can use; equals take turns.
+        /// Shots of a higher priority get every worker they can use; equals get equal parts
+        /// of what the workers can do.
         priority: i32,
         /// Frames open or finished but not yet taken, 1 to
         /// [`crate::MAX_FRAMES_IN_FLIGHT`]: the bound on the coordinator's memory.
@@ -117,7 +118,8 @@ pub enum Event {
     ShotPrioritised {
         /// The shot.
         shot: ShotId,
-        /// Shots of a higher priority get every worker they can use; equals take turns.
+        /// Shots of a higher priority get every worker they can use; equals get equal parts
+        /// of what the workers can do.
         priority: i32,
     },
     /// When an operator gives a worker that was blocked another chance.

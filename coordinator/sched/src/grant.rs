@@ -35,29 +35,26 @@ impl Scheduler {
             if self.ready.is_empty() {
                 break;
             }
-            match self.pick(worker) {
-                Some((shot, key, job)) => {
-                    self.grant(worker, shot, key, job);
-                    self.take_turn(shot);
-                }
-                None => self.park(worker),
+            if !self.grant_next(worker) {
+                self.park(worker);
             }
         }
         self.hedge();
     }
 
-    /// The next job for a worker, taken out of its shot.
-    fn pick(&mut self, worker: WorkerId) -> Option<(ShotId, JobKey, Job)> {
-        let known = self.workers.get(&worker)?;
-        let (active, active_speed) = (self.active, self.active_speed);
-        for &(_, _, id) in &self.ready {
-            let Some(shot) = self.shots.get_mut(&id) else { continue };
-            if shot.blocked.contains(&worker) {
-                continue;
-            }
-            let target_us = target_us(&self.config, shot, known, active_speed);
-            let target = target_us * known.speed.value();
-            let max_px = self.config.max_job_px;
+    /// Grants a worker its next job, if there is one for it.
+    pub(crate) fn grant_next(&mut self, worker: WorkerId) -> bool {
+        let Some((shot, again)) = self.find(worker) else { return false };
+        let Some((key, job)) = self.take(worker, shot, again) else { return false };
+        self.grant(worker, shot, key, job);
+        self.refresh_ready(shot);
+        true
+    }
+
+    /// Where the next job for a worker is: the shot, and the job if it waits there.
+    pub(crate) fn find(&self, worker: WorkerId) -> Option<(ShotId, Option<JobKey>)> {
+        self.ready.iter().find_map(|&(_, _, id)| {
+            let shot = self.shots.get(&id).filter(|shot| !shot.blocked.contains(&worker))?;
             let again = shot.waiting.iter().take(WAITING_LOOK).find(|(_, job)| {
                 let others = job.failed_on.iter().filter(|&failed| {
                     self.workers.get(failed).is_some_and(|failed| !failed.is_draining)
@@ -65,18 +62,30 @@ impl Scheduler {
                 });
                 !job.failed_on.contains(&worker)
                     || job.expiries >= HOPELESS_EXPIRIES
-                    || active <= shot.blocked.len() + others.count()
+                    || self.active <= shot.blocked.len() + others.count()
             });
-            let again = again.map(|(&key, _)| key);
-            let taken = match again {
-                Some(key) => shot.take_waiting(key, target, max_px).map(|job| (key, job)),
-                None => shot.cut(target, max_px),
-            };
-            if let Some((key, job)) = taken {
-                return Some((id, key, job));
+            match again {
+                Some((&key, _)) => Some((id, Some(key))),
+                None => shot.has_uncut().then_some((id, None)),
             }
+        })
+    }
+
+    /// Takes the next job for a worker, or a part of it, out of its shot.
+    fn take(
+        &mut self,
+        worker: WorkerId,
+        shot: ShotId,
+        again: Option<JobKey>,
+    ) -> Option<(JobKey, Job)> {
+        let known = self.workers.get(&worker)?;
+        let shot = self.shots.get_mut(&shot)?;
+        let target = target_us(&self.config, shot, known, self.active_speed) * known.speed.value();
+        let max_px = self.config.max_job_px;
+        match again {
+            Some(key) => shot.take_waiting(key, target, max_px).map(|job| (key, job)),
+            None => shot.cut(target, max_px),
         }
-        None
     }
 
     fn park(&mut self, worker: WorkerId) {
@@ -85,21 +94,6 @@ impl Scheduler {
         {
             self.hungry.remove(&key);
             self.parked.insert(worker);
-        }
-    }
-
-    /// Puts a shot behind the others of its priority.
-    fn take_turn(&mut self, shot: ShotId) {
-        self.turn += 1;
-        if let Some(known) = self.shots.get_mut(&shot)
-            && let Some(key) = known.ready.take()
-        {
-            self.ready.remove(&key);
-            if known.has_work() {
-                let key = (key.0, self.turn, shot);
-                known.ready = Some(key);
-                self.ready.insert(key);
-            }
         }
     }
 
@@ -136,6 +130,7 @@ impl Scheduler {
                 self.start_head(worker);
             }
         }
+        self.charge(shot, cost);
         for lease in leases {
             self.refresh_hedgeable(lease);
         }

@@ -38,12 +38,15 @@ mod config;
 mod event;
 mod grant;
 mod lease;
+mod order;
 mod outcome;
 mod rng;
 mod scheduler;
+mod share;
 mod shot;
 pub mod sim;
 mod split;
+mod why;
 mod worker;
 
 pub use config::{
@@ -52,4 +55,6 @@ pub use config::{
 pub use event::{
     Action, DropReason, Event, FrameFailure, LostReason, Micros, RefuseReason, ShotFailure,
 };
+pub use order::YIELD_US;
 pub use scheduler::{Account, Scheduler};
+pub use why::Why;

@@ -30,6 +30,8 @@ pub(crate) enum End {
     Lost,
     /// The worker has been blocked for its shot.
     Barred,
+    /// An order has made something else more urgent.
+    Preempted,
     /// Nobody wants the result any more: the job is not done again.
     Unwanted,
 }
@@ -43,7 +45,7 @@ impl Scheduler {
             self.actions.push_back(Action::Refuse { worker, lease: id, why });
             return;
         }
-        let Some(lease) = self.release(id) else { return };
+        let Some((lease, _)) = self.release(id) else { return };
         self.account.accepted += 1;
         self.leases.remember_accepted(id);
         let Some(shot) = self.shots.get_mut(&lease.shot) else { return };
@@ -90,6 +92,7 @@ impl Scheduler {
         if let Some(shot) = self.shots.get_mut(&lease.shot) {
             shot.costs.learn(lease.frame, lease.start, end, cost);
         }
+        self.charge(lease.shot, cost - lease.cost);
     }
 
     /// Says that a frame is complete, and perhaps its shot, if nothing of it is left.
@@ -210,16 +213,18 @@ impl Scheduler {
     /// Ends a lease without a result. The job waits for a new one unless it is held under
     /// another lease or is not wanted.
     pub(crate) fn end_lease(&mut self, id: LeaseId, end: End) {
-        let Some(lease) = self.release(id) else { return };
+        let Some((lease, spent)) = self.release(id) else { return };
+        self.charge(lease.shot, spent - lease.cost);
         let counter = match end {
             End::HandedBack => &mut self.account.handed_back,
             End::Failed => &mut self.account.failed,
             End::Expired => &mut self.account.expired,
             End::Lost => &mut self.account.lost,
-            End::Barred | End::Unwanted => &mut self.account.revoked,
+            End::Barred | End::Preempted | End::Unwanted => &mut self.account.revoked,
         };
         *counter += 1;
-        if matches!(end, End::Expired | End::Barred | End::Unwanted) {
+        self.account.preempted += u64::from(end == End::Preempted);
+        if matches!(end, End::Expired | End::Barred | End::Preempted | End::Unwanted) {
             self.actions.push_back(Action::Revoke { worker: lease.worker, lease: id });
         }
         self.refresh_hunger(lease.worker);
@@ -243,22 +248,29 @@ impl Scheduler {
         }
     }
 
-    /// Takes a lease out of the books; the worker goes on with the next one it holds.
-    fn release(&mut self, id: LeaseId) -> Option<Lease> {
+    /// Takes a lease out of the books; the worker goes on with the next one it holds. With it,
+    /// what it has cost if there is no result, cost units.
+    fn release(&mut self, id: LeaseId) -> Option<(Lease, f64)> {
         let lease = self.leases.held.remove(&id)?;
         if let Some(late_at) = lease.late_at {
             self.hedgeable.remove(&(late_at, id));
         }
+        let holder = self.workers.get(&lease.worker);
+        let was_head = holder.is_some_and(|worker| worker.held.front() == Some(&id));
+        let since_us = holder.map_or(0, |worker| self.now.since(worker.head_since));
+        let spent = self.spent(&lease, was_head, since_us);
         if let Some(worker) = self.workers.get_mut(&lease.worker) {
-            let was_head = worker.held.front() == Some(&id);
             worker.held.retain(|&held| held != id);
             if was_head {
                 if let Some(at) = worker.head_deadline.take() {
                     self.timers.remove(&(at, Timer::Head(lease.worker)));
                 }
+                if let Some(at) = worker.yields_at.take() {
+                    self.timers.remove(&(at, Timer::Yield(lease.worker)));
+                }
                 self.start_head(lease.worker);
             }
         }
-        Some(lease)
+        Some((lease, spent))
     }
 }

@@ -1,7 +1,7 @@
 //! The state machine: its parts, and what workers and shots that come and go do to it.
 //!
-//! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `check.rs` states what
-//! always holds.
+//! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `order.rs` obeys people,
+//! `share.rs` keeps equals equal, and `check.rs` states what always holds.
 
 use crate::config::{Config, MAX_SHOTS, MAX_WORKERS};
 use crate::event::{Action, DropReason, Event, Micros, ShotFailure};
@@ -27,8 +27,10 @@ pub struct Account {
     pub expired: u64,
     /// Given back.
     pub handed_back: u64,
-    /// Ended because nobody wants the result any more.
+    /// Ended because nobody wants the result any more, or not of this worker, or not now.
     pub revoked: u64,
+    /// Ended because an order made something else more urgent; part of `revoked`.
+    pub preempted: u64,
     /// Ended with the worker's connection.
     pub lost: u64,
     /// Granted on purpose while another worker held the same job; part of `granted`.
@@ -44,6 +46,8 @@ pub(crate) enum Timer {
     Beat(WorkerId),
     /// When the first job of a worker has run out of time.
     Head(WorkerId),
+    /// When a worker should have begun what an order has made urgent.
+    Yield(WorkerId),
 }
 
 /// The state machine. See the crate's documentation for how to drive it.
@@ -70,8 +74,6 @@ pub struct Scheduler {
     pub(crate) active: usize,
     pub(crate) active_threads: u64,
     pub(crate) active_speed: f64,
-    /// Counts grants, so that shots of one priority take turns.
-    pub(crate) turn: u64,
 }
 
 impl Scheduler {
@@ -95,7 +97,6 @@ impl Scheduler {
             active: 0,
             active_threads: 0,
             active_speed: 0.0,
-            turn: 0,
         }
     }
 
@@ -103,6 +104,10 @@ impl Scheduler {
     /// taken for the latest one seen. Drain [`Self::poll_action`] afterwards.
     pub fn handle(&mut self, now: Micros, event: Event) {
         self.now = self.now.max(now);
+        let may_urge = matches!(
+            event,
+            Event::ShotSubmitted { .. } | Event::ShotResumed { .. } | Event::ShotPrioritised { .. }
+        );
         match event {
             Event::WorkerJoined { worker, threads } => self.join(worker, threads),
             Event::WorkerLost { worker, why: _ } => self.forget_worker(worker),
@@ -147,12 +152,7 @@ impl Scheduler {
             }
             Event::ShotCanceled { shot } => self.forget_shot(shot),
             Event::ShotPaused { shot } => self.pause(shot),
-            Event::ShotResumed { shot } => {
-                if let Some(known) = self.shots.get_mut(&shot) {
-                    known.is_paused = false;
-                    self.refresh_ready(shot);
-                }
-            }
+            Event::ShotResumed { shot } => self.resume(shot),
             Event::ShotPrioritised { shot, priority } => self.prioritise(shot, priority),
             Event::WorkerCleared { worker, shot } => self.clear(worker, shot),
             Event::HeardFrom { worker } => self.hear(worker),
@@ -160,6 +160,10 @@ impl Scheduler {
         }
         self.fire_timers();
         self.dispatch();
+        if may_urge {
+            self.make_way();
+            self.dispatch();
+        }
     }
 
     /// The next thing to be done; `None` when all is said. Call it until then after each
@@ -265,6 +269,9 @@ impl Scheduler {
             if let Some(at) = gone.head_deadline {
                 self.timers.remove(&(at, Timer::Head(worker)));
             }
+            if let Some(at) = gone.yields_at {
+                self.timers.remove(&(at, Timer::Yield(worker)));
+            }
         }
     }
 
@@ -276,6 +283,7 @@ impl Scheduler {
         match made {
             Ok(made) => {
                 self.shots.insert(shot, made);
+                self.catch_up(shot, 0.0);
                 self.refresh_ready(shot);
             }
             Err(reason) => self.actions.push_back(Action::ShotFailed { shot, reason }),
@@ -296,37 +304,6 @@ impl Scheduler {
         self.shots.remove(&shot);
     }
 
-    /// Stops a shot without forgetting anything: its jobs wait for new leases.
-    fn pause(&mut self, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.is_paused = true;
-        let jobs = known.running.values();
-        let leases: Vec<LeaseId> = jobs.flat_map(|job| job.leases.iter().copied()).collect();
-        for lease in leases {
-            self.end_lease(lease, End::Barred);
-        }
-        self.refresh_ready(shot);
-    }
-
-    fn prioritise(&mut self, shot: ShotId, priority: i32) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.priority = priority;
-        if let Some(key) = known.ready.take() {
-            self.ready.remove(&key);
-        }
-        self.refresh_ready(shot);
-    }
-
-    /// Gives one worker another chance at a shot.
-    fn clear(&mut self, worker: WorkerId, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.faults.remove(&worker);
-        if known.blocked.remove(&worker) {
-            self.actions.push_back(Action::Unblocked { worker, shot });
-            self.unpark();
-        }
-    }
-
     fn fire_timers(&mut self) {
         while let Some(&(at, timer)) = self.timers.first() {
             if at > self.now {
@@ -336,6 +313,7 @@ impl Scheduler {
             match timer {
                 Timer::Beat(worker) => self.beat(worker),
                 Timer::Head(worker) => self.head_expired(worker),
+                Timer::Yield(worker) => self.yield_head(worker),
             }
         }
     }
@@ -364,24 +342,6 @@ impl Scheduler {
         let next_at = next_at.max(self.now.after(1));
         if next_at > self.now {
             self.timers.insert((next_at, Timer::Beat(worker)));
-        }
-    }
-
-    /// Brings a shot's place among the ready ones up to date.
-    pub(crate) fn refresh_ready(&mut self, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        match (known.ready, known.has_work()) {
-            (None, true) => {
-                let key = (std::cmp::Reverse(known.priority), self.turn, shot);
-                known.ready = Some(key);
-                self.ready.insert(key);
-                self.unpark();
-            }
-            (Some(key), false) => {
-                known.ready = None;
-                self.ready.remove(&key);
-            }
-            _ => {}
         }
     }
 

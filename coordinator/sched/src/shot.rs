@@ -15,7 +15,7 @@ use terrafarm_common::region::Split;
 /// A job's place: frame and first atom. No two jobs share one, since they do not overlap.
 pub(crate) type JobKey = (FrameIndex, u32);
 
-/// Which shot is served next: highest priority, then the one whose turn is longest ago.
+/// Which shot is served next: highest priority, then the one that was served least.
 pub(crate) type ReadyKey = (Reverse<i32>, u64, ShotId);
 
 /// A job that has been cut and is not done.
@@ -82,6 +82,8 @@ pub(crate) struct Shot {
     pub(crate) priority: i32,
     /// Whether it waits until someone resumes it.
     pub(crate) is_paused: bool,
+    /// Work charged to it, cost units; only differences between equals mean anything.
+    pub(crate) served: f64,
     /// The most frames open or untaken.
     pub(crate) frames_in_flight: u32,
     /// The first frame not yet begun.
@@ -143,6 +145,7 @@ impl Shot {
             frames,
             priority,
             is_paused: false,
+            served: 0.0,
             frames_in_flight,
             next_frame: 0,
             open: BTreeMap::new(),
@@ -169,8 +172,12 @@ impl Shot {
 
     /// Whether there is anything to grant.
     pub(crate) fn has_work(&self) -> bool {
-        let some = !self.waiting.is_empty() || self.cutting.is_some() || self.frames_to_open() > 0;
-        some && !self.is_paused
+        (!self.waiting.is_empty() || self.has_uncut()) && !self.is_paused
+    }
+
+    /// Whether there is anything that no job has been cut from.
+    pub(crate) fn has_uncut(&self) -> bool {
+        self.cutting.is_some() || self.frames_to_open() > 0
     }
 
     /// Whether every frame is complete or has failed.

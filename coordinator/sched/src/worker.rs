@@ -75,6 +75,8 @@ pub(crate) struct Worker {
     pub(crate) head_since: Micros,
     /// When the first of `held` expires.
     pub(crate) head_deadline: Option<Micros>,
+    /// When the first of `held` has to have made way for something more urgent.
+    pub(crate) yields_at: Option<Micros>,
     /// Wants to leave.
     pub(crate) is_draining: bool,
     /// Let a lease expire and has done nothing since: gets one job at a time.
@@ -96,6 +98,7 @@ impl Worker {
             held: VecDeque::new(),
             head_since: now,
             head_deadline: None,
+            yields_at: None,
             is_draining: false,
             is_suspect: false,
             heard_at: now,

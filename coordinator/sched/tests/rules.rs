@@ -433,6 +433,79 @@ fn a_full_queue_of_endless_shots_costs_nothing_before_they_begin() {
     assert_eq!(refused, [Action::ShotFailed { shot: ShotId(9999), reason: full }]);
 }
 
+#[test]
+fn a_shot_that_cannot_go_on_does_not_stop_its_equals() {
+    let mut farm = Farm::new();
+    farm.join(1, 1);
+    farm.join(2, 1);
+    // Of one, frames are never taken; of the other, worker 1 fails at everything.
+    farm.submit_split(1, 100, 0, 1, Split::Tiles(640));
+    farm.submit_split(2, 100, 0, 200, Split::Tiles(640));
+    farm.submit_split(3, 100, 0, 200, Split::Tiles(640));
+    let mut accepted = [0; 4];
+    for _ in 0..100 {
+        let Some(job) = farm.grants.pop_front() else { break };
+        farm.now += 5;
+        if job.shot == ShotId(2) && job.worker == WorkerId(1) {
+            farm.fail(job);
+        } else {
+            farm.done(job, 5);
+            accepted[job.shot.0 as usize] += 1;
+        }
+    }
+    assert_eq!(accepted[1], 1, "its only frame in flight");
+    assert!(accepted[2] > 30 && accepted[3] > 30, "{accepted:?}");
+}
+
+#[test]
+fn a_frame_that_is_not_done_has_a_reason() {
+    let mut farm = Farm::new();
+    let (shot, other) = (ShotId(1), ShotId(2));
+    let why = |farm: &Farm, frame| farm.scheduler.why(shot, frame);
+    assert_eq!(why(&farm, 0), Why::NotUnderWay);
+    farm.submit_split(1, 5, 0, 2, Split::Tiles(640));
+    assert_eq!(why(&farm, 5), Why::NoSuchFrame);
+    assert_eq!(why(&farm, 0), Why::NoWorker);
+    farm.join(1, 1);
+    let workers = vec![WorkerId(1)];
+    assert_eq!(why(&farm, 0), Why::Running { jobs: 1, workers, waiting: 0 });
+    assert_eq!(why(&farm, 3), Why::WindowFull { open: 2, untaken: 0, limit: 2 });
+    assert!(why(&farm, 0).to_string().contains("1 job runs on"), "{}", why(&farm, 0));
+    let first = farm.next_of(1).unwrap();
+    farm.done(first, 5);
+    assert_eq!(why(&farm, 0), Why::NotTaken);
+    farm.tell(Event::FrameTaken { shot, frame: 0 });
+    assert_eq!(why(&farm, 0), Why::Over);
+    farm.tell(Event::ShotPaused { shot });
+    assert_eq!((why(&farm, 1), farm.scheduler.is_paused(shot)), (Why::Paused, true));
+    farm.tell(Event::ShotPrioritised { shot, priority: -3 });
+    assert_eq!(farm.scheduler.priority(shot), Some(-3));
+    farm.grants.clear();
+    farm.submit(2, 50, 0, 8);
+    farm.tell(Event::ShotResumed { shot });
+    assert_eq!(why(&farm, 1), Why::Outranked { by: other });
+    assert_eq!(farm.scheduler.blocked(WorkerId(1)), []);
+    assert_eq!(farm.scheduler.heard_at(WorkerId(1)), Some(Micros(farm.now)));
+    assert_eq!(farm.scheduler.heard_at(WorkerId(2)), None);
+    assert_eq!(farm.scheduler.speed_of(WorkerId(1)), Some(1.0));
+    farm.tell(Event::WorkerDraining { worker: WorkerId(1) });
+    assert!(farm.scheduler.is_draining(WorkerId(1)));
+    assert_eq!(why(&farm, 4), Why::NoWorker);
+}
+
+#[test]
+fn a_job_that_waits_after_a_failure_names_who_failed() {
+    let mut farm = Farm::new();
+    farm.join(1, 1);
+    farm.join(2, 1);
+    farm.submit_split(1, 4, 0, 4, Split::Tiles(640));
+    let failed = farm.next_of(1).unwrap();
+    farm.fail(failed);
+    let expected = Why::Retrying { jobs: 1, failed_on: vec![WorkerId(1)] };
+    assert_eq!(farm.scheduler.why(failed.shot, failed.frame), expected);
+    assert!(expected.to_string().contains("1 job waits after failing on"), "{expected}");
+}
+
 fn any_event() -> impl Strategy<Value = Event> {
     let worker = || (1u64..6).prop_map(WorkerId);
     let lease = || prop_oneof![9 => 0u64..80, 1 => any::<u64>()].prop_map(LeaseId);
@@ -452,6 +525,10 @@ fn any_event() -> impl Strategy<Value = Event> {
         4 => (worker(), lease()).prop_map(|(worker, lease)| Event::JobFailed { worker, lease, reason: "bad".into() }),
         3 => (shot(), 0u32..6).prop_map(|(shot, frame)| Event::FrameTaken { shot, frame }),
         1 => shot().prop_map(|shot| Event::ShotCanceled { shot }),
+        1 => shot().prop_map(|shot| Event::ShotPaused { shot }),
+        1 => shot().prop_map(|shot| Event::ShotResumed { shot }),
+        1 => (shot(), -1i32..2).prop_map(|(shot, priority)| Event::ShotPrioritised { shot, priority }),
+        1 => (worker(), shot()).prop_map(|(worker, shot)| Event::WorkerCleared { worker, shot }),
         2 => worker().prop_map(|worker| Event::HeardFrom { worker }),
         2 => Just(Event::Tick),
     ]
