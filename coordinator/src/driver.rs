@@ -391,7 +391,8 @@ impl FarmLine {
         let (events, inbox) = mpsc::channel(EVENTS);
         let (views, view) = watch::channel(Arc::default());
         let line = FarmLine { events, view, last_shot: Arc::default() };
-        tokio::spawn(drive(config, inbox, views, line.last_shot.clone(), stop));
+        let sight = Sight { views, thumbnails: Arc::default() };
+        tokio::spawn(drive(config, inbox, sight, line.last_shot.clone(), stop));
         line
     }
 
