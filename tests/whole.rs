@@ -14,6 +14,10 @@ mod tidy;
 #[path = "whole/farm.rs"]
 mod farm;
 
+/// The queue on disk outlives its coordinator.
+#[path = "whole/queue.rs"]
+mod queue;
+
 /// Whoever has not the token, floods, dawdles or lies harms nobody who works.
 #[path = "whole/hostile.rs"]
 mod hostile;

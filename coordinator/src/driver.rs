@@ -383,3 +383,32 @@ fn give_up(lines: &mut HashMap<Peer, Line>, peer: Peer) -> Option<(Peer, String)
 pub fn peer_of(id: u64, is_worker: bool) -> Peer {
     if is_worker { Peer::Worker(WorkerId(id)) } else { Peer::Client(ClientId(id)) }
 }
+
+#[cfg(test)]
+impl FarmLine {
+    /// A farm of its own without sockets, until it is told to stop.
+    pub fn to_new_farm(config: Config, stop: CancellationToken) -> Self {
+        let (events, inbox) = mpsc::channel(EVENTS);
+        let (views, view) = watch::channel(Arc::default());
+        let line = FarmLine { events, view, last_shot: Arc::default() };
+        let sight = Sight { views, thumbnails: Arc::default() };
+        tokio::spawn(drive(config, inbox, sight, line.last_shot.clone(), stop));
+        line
+    }
+
+    /// A worker inside this process; what the farm says to it comes out of the end.
+    pub async fn hire(&self, worker: WorkerId) -> OutboxEnd {
+        let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
+        let greeting = Greeting { name: format!("{worker}"), threads: 2 };
+        let traits = peer::PeerTraits { greeting, loopback: true };
+        let open = ToDriver::Open(Peer::Worker(worker), outbox, CancellationToken::new(), traits);
+        let _ = self.events.send(open).await;
+        end
+    }
+
+    /// Passes on what such a worker says; false if the farm has ended.
+    pub async fn work(&self, worker: WorkerId, message: impl Into<Message>) -> bool {
+        let event = ToDriver::Event(Peer::Worker(worker), PeerEvent::Said(message.into()));
+        self.events.send(event).await.is_ok()
+    }
+}

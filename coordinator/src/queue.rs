@@ -374,3 +374,6 @@ async fn blocking<T: Send + 'static>(
 ) -> Result<T, QueueError> {
     tokio::task::spawn_blocking(work).await.map_err(|_| QueueError::Stopping)?
 }
+
+#[cfg(test)]
+mod tests;

@@ -232,11 +232,16 @@ impl Task {
     async fn obey(&mut self, command: Command) {
         match command {
             Command::Submit(plan, answer) => {
+                let submitted = self.submit(*plan).await;
+                self.publish();
                 // Who asked may have gone; the shot is there all the same.
-                let _ = answer.send(self.submit(*plan).await);
+                let _ = answer.send(submitted);
             }
             Command::Order(order, answer) => {
-                let _ = answer.send(self.order(order).await);
+                let carried_out = self.order(order).await;
+                // Shown before it is answered: whoever looks then sees it.
+                self.publish();
+                let _ = answer.send(carried_out);
             }
             Command::Came(hash) => {
                 let lacking = |(_, shot): &(ShotId, &super::book::Shot)| shot.lacks == Some(hash);
@@ -248,7 +253,6 @@ impl Task {
                 }
             }
         }
-        self.publish();
     }
 
     async fn submit(&mut self, mut plan: ShotPlan) -> Result<ShotId, QueueError> {
