@@ -74,7 +74,11 @@ impl Office {
     }
 
     /// Asks again and again until something holds of an answer.
-    pub fn wait(&self, path: &str, holds: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
+    pub fn wait(
+        &self,
+        path: &str,
+        holds: impl Fn(&serde_json::Value) -> bool,
+    ) -> serde_json::Value {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let answer = self.json(path);
@@ -141,7 +145,8 @@ pub fn http(address: &str, method: &str, path: &str, more: &[(&str, &str)], body
 fn unchunk(mut bytes: &[u8]) -> Vec<u8> {
     let mut whole = Vec::new();
     while let Some(end) = bytes.windows(2).position(|two| two == b"\r\n") {
-        let length = usize::from_str_radix(std::str::from_utf8(&bytes[..end]).unwrap(), 16).unwrap();
+        let length =
+            usize::from_str_radix(std::str::from_utf8(&bytes[..end]).unwrap(), 16).unwrap();
         if length == 0 {
             break;
         }
@@ -184,7 +189,13 @@ fn a_submitted_shot_is_rendered_without_its_submitter_and_fetched_as_a_local_ren
     let frame = office.get(&format!("{path}/frames/5.png"));
     assert_eq!((frame.status, frame.header("content-type")), (200, Some("image/png")));
     assert_eq!(frame.body, whole);
-    let part = http(&office.http, "GET", &format!("{path}/frames/5.png"), &[("Range", "bytes=10-19")], b"");
+    let part = http(
+        &office.http,
+        "GET",
+        &format!("{path}/frames/5.png"),
+        &[("Range", "bytes=10-19")],
+        b"",
+    );
     assert_eq!((part.status, &part.body[..]), (206, &whole[10..20]));
     assert_eq!(part.header("content-range").unwrap(), format!("bytes 10-19/{}", whole.len()));
     let film = world.dir.path("film.mp4");
@@ -354,9 +365,8 @@ fn where_a_key_is_asked_for_nothing_is_told_without_it() {
     let since = Instant::now();
     assert_eq!(get("/api/v1/farm", &[("Authorization", "Bearer 00")]).status, 401);
     assert!(since.elapsed() >= Duration::from_secs(1), "a wrong key costs a second");
-    let login = |key: &str| {
-        http(&office.http, "POST", "/login", &[], format!("key={key}").as_bytes())
-    };
+    let login =
+        |key: &str| http(&office.http, "POST", "/login", &[], format!("key={key}").as_bytes());
     assert!(login("00").header("set-cookie").is_none());
     let entered = login(&format!("+{}", key.to_uppercase()));
     let cookie = entered.header("set-cookie").unwrap();
@@ -427,7 +437,10 @@ fn streams_of_events_are_bounded_and_tell_the_part_of_the_lists_that_is_asked_fo
     let names: Vec<_> = events.iter().map(|(name, _)| name.as_str()).collect();
     assert_eq!(names, ["farm", "shots", "workers"]);
     let shots = &events[1].1;
-    assert_eq!((shots["total"].as_u64(), shots["shots"][0]["name"].as_str()), (Some(3), Some("two")));
+    assert_eq!(
+        (shots["total"].as_u64(), shots["shots"][0]["name"].as_str()),
+        (Some(3), Some("two"))
+    );
     let more: Vec<_> = (1..64).map(|_| first_events(&office.http, "").1).collect();
     assert_eq!(office.get("/api/v1/events").status, 503);
     drop((first, more));
