@@ -207,8 +207,13 @@ impl Drop for Running {
 
 /// A coordinator of its own process, and its address.
 pub fn coordinator() -> (Running, String) {
-    let mut running =
-        Running::start(terrafarm().args(["-v", "coordinator", "--listen", "127.0.0.1:0"]));
+    let mut running = Running::start(terrafarm().args([
+        "-v",
+        "coordinator",
+        "--listen",
+        "127.0.0.1:0",
+        "--no-http",
+    ]));
     let line = running.expect("coordinator on ");
     let address = line.rsplit(' ').next().unwrap().to_owned();
     (running, address)
