@@ -18,9 +18,22 @@ mod farm;
 #[path = "whole/faults.rs"]
 mod faults;
 
+/// The queue on disk outlives its coordinator.
+#[path = "whole/queue.rs"]
+mod queue;
+
 /// Whoever has not the token, floods, dawdles or lies harms nobody who works.
 #[path = "whole/hostile.rs"]
 mod hostile;
+
+/// The coordinator's API: what it answers, whom it lets in, and how soon.
+#[path = "whole/api.rs"]
+mod api;
+
+/// The page in a browser.
+#[cfg(unix)]
+#[path = "whole/page.rs"]
+mod page;
 
 /// What is wrong is said, nothing half-written stays, the exit code is 2.
 #[path = "whole/bad_input.rs"]

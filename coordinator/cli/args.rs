@@ -1,5 +1,7 @@
 //! The command line as typed.
 
+pub mod queue;
+
 use crate::input::{parse_method, parse_tolerance};
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
@@ -40,6 +42,28 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Render for a coordinator until told to stop
     Worker(Worker),
+    /// Leave a shot in a coordinator's queue: it is rendered when you have gone
+    Submit(Box<queue::Submit>),
+    /// List the shots of a farm, or one of them
+    Shots(queue::Shots),
+    /// List the workers of a farm
+    Workers(queue::Workers),
+    /// Let a shot wait; jobs that run are stopped
+    Pause(queue::OneShot),
+    /// Let a shot go on
+    Resume(queue::OneShot),
+    /// Give a shot up
+    Cancel(queue::OneShot),
+    /// Change how urgent a shot is
+    Priority(queue::Priority),
+    /// Let a worker try again what it was blocked for
+    Clear(queue::Clear),
+    /// Let a worker finish what it renders, and leave
+    Drain(queue::Drain),
+    /// Say why a frame is not done
+    Why(queue::Why),
+    /// Bring the frames or the film of a shot here, checked
+    Fetch(queue::Fetch),
     /// Print the farm token of this PC, made if there is none; or enter that of a farm
     Token(Token),
     /// Say how far two pictures, or two folders of numbered pictures, are apart
@@ -249,6 +273,9 @@ pub struct Token {
     /// Take the token from a line of standard input and keep it here
     #[arg(long)]
     pub enter: bool,
+    /// Print the key of the page and the API by HTTP, which is derived from the token
+    #[arg(long, conflicts_with = "enter")]
+    pub web: bool,
 }
 
 /// `terrafarm render`
@@ -330,6 +357,16 @@ pub struct Coordinator {
     /// Memory for terrain tiles on their way to workers, MiB
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
     pub blob_memory: u64,
+    /// Folder for a queue of shots that outlives whoever submits them, and the coordinator
+    #[arg(long, value_name = "FOLDER")]
+    pub data: Option<PathBuf>,
+    /// The page and the API by HTTP
+    #[command(flatten)]
+    pub web: queue::Web,
+    /// Render this share of the jobs a second time, by another worker, and compare: one that
+    /// differs from two others gets no more jobs and is reported. Costs as much of the farm
+    #[arg(long, value_name = "PERCENT", default_value = "0")]
+    pub audit: Share,
 }
 
 /// `terrafarm worker`
@@ -605,21 +642,21 @@ pub struct BenchStability {
     pub json: Option<PathBuf>,
 }
 
-fn parse_size(text: &str) -> Result<(u32, u32), String> {
+pub(crate) fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let side = |part: &str| part.parse::<u32>().ok().filter(|n| (1..=16_384).contains(n));
     text.split_once('x')
         .and_then(|(width, height)| Some((side(width)?, side(height)?)))
         .ok_or_else(|| "write WIDTHxHEIGHT in pixels, such as 1280x720, each 1 to 16384".into())
 }
 
-fn parse_range(text: &str) -> Result<(u32, u32), String> {
+pub(crate) fn parse_range(text: &str) -> Result<(u32, u32), String> {
     text.split_once("..")
         .and_then(|(first, end)| Some((first.parse().ok()?, end.parse().ok()?)))
         .filter(|(first, end)| first < end)
         .ok_or_else(|| "write FIRST..END with FIRST below END, such as 0..24".into())
 }
 
-fn parse_split(text: &str) -> Result<Split, String> {
+pub(crate) fn parse_split(text: &str) -> Result<Split, String> {
     match text.split_once(':') {
         None if text == "columns" => Ok(Split::Columns),
         None if text == "tiles" => Ok(Split::Tiles(128)),

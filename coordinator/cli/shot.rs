@@ -37,8 +37,6 @@ pub const FRAMES_IN_FLIGHT: u32 = 3;
 const PATIENCE: Duration = Duration::from_secs(8);
 /// How long a coordinator that went away is waited for: a PC that restarts takes minutes.
 const COORDINATOR_PATIENCE: Duration = Duration::from_secs(15 * 60);
-/// Shown instead of a frame that could not be rendered: nobody takes it for terrain.
-const FAILED_FRAME_RGB: [u8; 3] = [255, 0, 255];
 
 /// Everything that is decided before the first ray.
 pub struct Plan {
@@ -226,7 +224,6 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
     let in_flight = plan.frames_in_flight as usize;
     let (updates, inbox) = mpsc::channel(2 * in_flight + 8);
     let (taken, taken_out) = mpsc::channel(in_flight + 8);
-    let samples_per_pixel = u64::from(plan.quality.samples_per_side).pow(2);
     let bar = progress::bar("frames", u64::from(spec.frames));
     let (first_sign, begun) = oneshot::channel();
     let desk = Desk {
@@ -237,7 +234,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         first_sign: Some(first_sign),
         workers: 0,
         worst_p99_px: None,
-        samples: u64::from(camera.width) * u64::from(camera.height) * samples_per_pixel,
+        samples_per_side: plan.quality.samples_per_side,
     };
     let hint = tokio::spawn(say_if_nobody_works(begun, bar.clone(), coordinator.address.clone()));
     let writing = tokio::task::spawn_blocking(move || desk.write(sink, inbox, &taken));
@@ -298,15 +295,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         fallback_share: fallbacks.share(),
         frames: records,
         failed,
-        workers: done
-            .workers
-            .iter()
-            .map(|share| WorkerEntry {
-                name: share.name.clone(),
-                jobs: share.jobs,
-                render_ms: share.cost_us as f64 / 1e3,
-            })
-            .collect(),
+        workers: done.workers.iter().map(WorkerEntry::new).collect(),
     };
     let manifest_path = manifest.save(&finished.output)?;
     let seconds = started.elapsed().as_secs_f64();
@@ -336,8 +325,8 @@ struct Desk {
     workers: u32,
     /// The largest 99th percentile of the errors of a frame so far, pixels.
     worst_p99_px: Option<f64>,
-    /// Samples of a frame.
-    samples: u64,
+    /// Samples along each side of a pixel.
+    samples_per_side: u32,
 }
 
 /// Samples that a method could not do its own way and gave a ray of their own.
@@ -348,11 +337,6 @@ struct Fallbacks {
 }
 
 impl Fallbacks {
-    /// What a worker counted, which cannot be more than there are.
-    fn new(count: u64, of: u64) -> Self {
-        Fallbacks { count: count.min(of), of }
-    }
-
     fn add(&mut self, more: Fallbacks) {
         self.count += more.count;
         self.of += more.of;
@@ -441,7 +425,7 @@ impl Desk {
         written: &mut Written,
     ) -> anyhow::Result<()> {
         let Some((picture, facts)) = frame else {
-            sink.put(index, &marked(self.spec.width, self.spec.height))?;
+            sink.put(index, &sink::failed_frame(self.spec.width, self.spec.height))?;
             return Ok(());
         };
         sink.put(index, &picture)?;
@@ -450,39 +434,17 @@ impl Desk {
         {
             sink::poster::save(path, &picture)?;
         }
-        let errors = facts.check.as_ref();
-        let error_px = errors.and_then(Summary::error_px);
-        if let Some(errors) = errors {
+        let entry = FrameEntry::new(self.first + index, &picture, &facts, self.samples_per_side);
+        if let Some(errors) = &facts.check {
             written.errors.get_or_insert_default().merge(errors);
-            let p99_px = error_px.map(|error| error.p99);
-            self.worst_p99_px = p99_px.into_iter().chain(self.worst_p99_px).reduce(f64::max);
+            self.worst_p99_px =
+                entry.error_px_p99.into_iter().chain(self.worst_p99_px).reduce(f64::max);
         }
-        let fallbacks = Fallbacks::new(facts.fallbacks, self.samples);
-        written.fallbacks.add(fallbacks);
+        let pixels = u64::from(self.spec.width) * u64::from(self.spec.height);
+        let samples = pixels * u64::from(self.samples_per_side).pow(2);
+        written.fallbacks.add(Fallbacks { count: entry.fallbacks, of: samples });
         self.say(written);
-        written.records.push(FrameEntry {
-            index: self.first + index,
-            sha256: sink::pixels_sha256(&picture).to_hex(),
-            ms: facts.elapsed_us as f64 / 1e3,
-            render_ms: facts.cost_us as f64 / 1e3,
-            jobs: facts.jobs,
-            fallbacks: fallbacks.count,
-            fallback_share: fallbacks.share(),
-            below_ground: facts.below_ground,
-            error_px_p99: error_px.map(|error| error.p99),
-            error_px_max: error_px.map(|error| error.max),
-            depth_error_m_p99: errors.and_then(Summary::depth_m).map(|depth| depth.p99),
-            mismatch: error_px.and(errors).map(Summary::mismatch),
-            checked_pixels: errors.map(Summary::samples),
-        });
+        written.records.push(entry);
         Ok(())
     }
-}
-
-fn marked(width: u32, height: u32) -> Rgb8 {
-    let mut picture = Rgb8::new(width, height);
-    for pixel in picture.pixels_mut().chunks_exact_mut(3) {
-        pixel.copy_from_slice(&FAILED_FRAME_RGB);
-    }
-    picture
 }

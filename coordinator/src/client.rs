@@ -404,22 +404,32 @@ impl Talk {
     }
 
     fn unpack(&self, frame: Frame) -> Result<Update, ClientError> {
-        let (width, height) = self.size;
-        let expected = width as usize * height as usize * 3;
-        let unusable = |why: String| ClientError::Refused(format!("a frame is unusable: {why}"));
-        let pixels = frame.pixels.unpack(expected).map_err(|why| unusable(why.to_string()))?;
-        let picture = Rgb8::from_pixels(width, height, Vec::from(pixels))
-            .ok_or_else(|| unusable("its size is wrong".into()))?;
-        let facts = FrameFacts {
-            jobs: frame.jobs,
-            cost_us: frame.report.cost_us,
-            elapsed_us: frame.elapsed_us,
-            fallbacks: frame.report.fallbacks,
-            below_ground: frame.report.below_ground,
-            check: frame.check,
-        };
-        Ok(Update::Frame(frame.frame, picture, facts))
+        let index = frame.frame;
+        let (picture, facts) = unpack(frame, self.size).map_err(ClientError::Refused)?;
+        Ok(Update::Frame(index, picture, facts))
     }
+}
+
+/// The picture in a frame's message, and what it took.
+///
+/// # Errors
+/// If the pixels do not make a picture of this size, in words.
+pub(crate) fn unpack(frame: Frame, size: (u32, u32)) -> Result<(Rgb8, FrameFacts), String> {
+    let (width, height) = size;
+    let expected = width as usize * height as usize * 3;
+    let unusable = |why: String| format!("a frame is unusable: {why}");
+    let pixels = frame.pixels.unpack(expected).map_err(|why| unusable(why.to_string()))?;
+    let picture = Rgb8::from_pixels(width, height, Vec::from(pixels))
+        .ok_or_else(|| unusable("its size is wrong".into()))?;
+    let facts = FrameFacts {
+        jobs: frame.jobs,
+        cost_us: frame.report.cost_us,
+        elapsed_us: frame.elapsed_us,
+        fallbacks: frame.report.fallbacks,
+        below_ground: frame.report.below_ground,
+        check: frame.check,
+    };
+    Ok((picture, facts))
 }
 
 /// What the submitting task sends.

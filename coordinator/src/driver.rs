@@ -4,19 +4,23 @@
 //! wait, and TCP slows the senders down. Each peer's outbox is bounded; a peer whose
 //! outbox is full does not read, and is dropped.
 
+use crate::api::{self, Desk, Web};
 use crate::blobs::ClientId;
-use crate::farm::{Farm, Out, Peer, PeerEvent};
+use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
+use crate::queue::{Queue, QueueConfig, QueueError};
+use crate::thumbnails::Thumbnails;
 use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::sync::atomic::AtomicU64;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
+use terrafarm_wire::link::{self, Outbox, OutboxEnd, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -54,6 +58,8 @@ pub struct Config {
     pub seed: u64,
     /// Settings of the scheduler; heartbeat and silence are told to the workers.
     pub scheduler: terrafarm_sched::Config,
+    /// The queue on disk, if there is to be one.
+    pub queue: Option<QueueConfig>,
 }
 
 impl Default for Config {
@@ -67,6 +73,7 @@ impl Default for Config {
             greeting_limit: Duration::from_secs(5),
             seed: 1,
             scheduler: terrafarm_sched::Config::default(),
+            queue: None,
         }
     }
 }
@@ -83,17 +90,33 @@ pub enum CoordinatorError {
          strangers; give one, or say --plain on a network you trust"
     )]
     NoToken(SocketAddr),
+    /// The queue on disk cannot be used.
+    #[error(transparent)]
+    Queue(#[from] QueueError),
 }
 
 /// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
 /// function returns when every connection has ended.
 ///
 /// # Errors
-/// If the socket cannot be used at all; refused connections and lost peers are normal
+/// If the socket or the queue on disk cannot be used at all; refused connections and lost peers are normal
 /// work and only logged.
 pub async fn run(
     config: Config,
     listener: TcpListener,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), CoordinatorError> {
+    run_with_page(config, listener, None, shutdown).await
+}
+
+/// As [`run`], with the API by HTTP and the page.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_with_page(
+    config: Config,
+    listener: TcpListener,
+    web: Option<Web>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
     let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
@@ -103,10 +126,27 @@ pub async fn run(
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
-    let (views, _view) = watch::channel(Arc::default());
-    let driver = tasks.spawn(drive(config.clone(), inbox, views, stop.clone()));
+    let (views, view) = watch::channel(Arc::default());
+    let farm = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
+    // First, so that no number of a shot is given twice.
+    let queue = match config.queue.clone() {
+        Some(queue) => {
+            let (queue, task) = Queue::open(queue, farm.clone()).await?;
+            tasks.spawn(task.run(stop.clone()));
+            Some(queue)
+        }
+        None => None,
+    };
+    let thumbnails = Arc::<Thumbnails>::default();
+    let sight = Sight { views, thumbnails: thumbnails.clone() };
+    let last_shot = farm.last_shot.clone();
+    let driver = tasks.spawn(drive(config.clone(), inbox, sight, last_shot, stop.clone()));
+    let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
+    if let Some(web) = web {
+        tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
+    }
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events);
+    let admission = Admission::new(&config, events, api::router(desk), stop.clone());
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -145,13 +185,44 @@ pub enum ToDriver {
 
 /// The way from the desk to the driver.
 #[derive(Clone)]
-#[expect(dead_code, reason = "the desk comes next")]
 pub struct FarmLine {
     events: mpsc::Sender<ToDriver>,
     view: watch::Receiver<Arc<FarmView>>,
+    last_shot: Arc<AtomicU64>,
 }
 
+/// Messages that may wait for a client inside this process, on each lane.
+const INSIDE_QUEUE: usize = 4096;
+
 impl FarmLine {
+    /// Opens a client inside this process: what the farm says to it comes out of the end,
+    /// which closes when the farm gives the client up.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn join(&self, client: ClientId, name: &str) -> Result<OutboxEnd, OrderError> {
+        let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
+        let greeting = Greeting { name: name.to_owned(), threads: 0 };
+        let traits = peer::PeerTraits { greeting, loopback: true };
+        let open = ToDriver::Open(Peer::Client(client), outbox, CancellationToken::new(), traits);
+        self.events.send(open).await.map_err(|_| OrderError::Stopping)?;
+        Ok(end)
+    }
+
+    /// Passes on what such a client says.
+    ///
+    /// # Errors
+    /// If the coordinator is stopping.
+    pub async fn tell(&self, client: ClientId, event: PeerEvent) -> Result<(), OrderError> {
+        let event = ToDriver::Event(Peer::Client(client), event);
+        self.events.send(event).await.map_err(|_| OrderError::Stopping)
+    }
+
+    /// The counter of all shots.
+    pub fn last_shot(&self) -> &AtomicU64 {
+        &self.last_shot
+    }
+
     /// Has an order carried out and waits for what came of it.
     ///
     /// # Errors
@@ -176,15 +247,23 @@ struct Line {
     loopback: bool,
 }
 
+/// Where the driver puts what is to be seen.
+struct Sight {
+    views: watch::Sender<Arc<FarmView>>,
+    thumbnails: Arc<Thumbnails>,
+}
+
 async fn drive(
     config: Config,
     mut inbox: mpsc::Receiver<ToDriver>,
-    views: watch::Sender<Arc<FarmView>>,
+    sight: Sight,
+    last_shot: Arc<AtomicU64>,
     stop: CancellationToken,
 ) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
-    let mut farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    let mut farm = farm.counted_by(last_shot);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     let mut looks = tokio::time::interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -212,14 +291,14 @@ async fn drive(
                 None => break,
             },
             _ = looks.tick() => {
-                views.send_if_modified(|view| {
-                    *view = Arc::new(farm.view(now()));
+                sight.views.send_if_modified(|view| {
+                    *view = Arc::new(farm.view(now(), wall_s()));
                     true
                 });
             }
         }
         while let Some(out) = farm.poll_out() {
-            if let Some((peer, why)) = carry(out, &mut lines) {
+            if let Some((peer, why)) = carry(out, &mut lines, &sight.thumbnails) {
                 farm.handle(now(), peer, PeerEvent::Gone(LostReason::Broken, why));
             }
         }
@@ -230,6 +309,11 @@ async fn drive(
     }
 }
 
+/// Seconds since 1970 began.
+fn wall_s() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
 async fn sleep_until(due: Option<Instant>) {
     match due {
         Some(due) => tokio::time::sleep_until(due.into()).await,
@@ -238,7 +322,11 @@ async fn sleep_until(due: Option<Instant>) {
 }
 
 /// Carries out one order. Returns a peer that has to be given up, and why.
-fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
+fn carry(
+    out: Out,
+    lines: &mut HashMap<Peer, Line>,
+    thumbnails: &Arc<Thumbnails>,
+) -> Option<(Peer, String)> {
     match out {
         Out::Send(peer, message) => {
             let line = lines.get(&peer)?;
@@ -253,8 +341,11 @@ fn carry(out: Out, lines: &mut HashMap<Peer, Line>) -> Option<(Peer, String)> {
             let line = lines.get(&peer)?;
             let (outbox, hang_up) = (line.outbox.clone(), line.hang_up.clone());
             let loopback = line.loopback;
+            let thumbnails = thumbnails.clone();
             // At most as many at once as frames may be in flight.
             tokio::task::spawn_blocking(move || {
+                let (shot, frame) = head.place();
+                thumbnails.keep(shot, frame, &picture);
                 let pixels = picture.into_pixels().into();
                 let packed =
                     if loopback { Pixels::raw(pixels) } else { Pixels::compressed(pixels) };
@@ -291,4 +382,33 @@ fn give_up(lines: &mut HashMap<Peer, Line>, peer: Peer) -> Option<(Peer, String)
 /// Numbers of connections, in the order of their greeting.
 pub fn peer_of(id: u64, is_worker: bool) -> Peer {
     if is_worker { Peer::Worker(WorkerId(id)) } else { Peer::Client(ClientId(id)) }
+}
+
+#[cfg(test)]
+impl FarmLine {
+    /// A farm of its own without sockets, until it is told to stop.
+    pub fn to_new_farm(config: Config, stop: CancellationToken) -> Self {
+        let (events, inbox) = mpsc::channel(EVENTS);
+        let (views, view) = watch::channel(Arc::default());
+        let line = FarmLine { events, view, last_shot: Arc::default() };
+        let sight = Sight { views, thumbnails: Arc::default() };
+        tokio::spawn(drive(config, inbox, sight, line.last_shot.clone(), stop));
+        line
+    }
+
+    /// A worker inside this process; what the farm says to it comes out of the end.
+    pub async fn hire(&self, worker: WorkerId) -> OutboxEnd {
+        let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
+        let greeting = Greeting { name: format!("{worker}"), threads: 2 };
+        let traits = peer::PeerTraits { greeting, loopback: true };
+        let open = ToDriver::Open(Peer::Worker(worker), outbox, CancellationToken::new(), traits);
+        let _ = self.events.send(open).await;
+        end
+    }
+
+    /// Passes on what such a worker says; false if the farm has ended.
+    pub async fn work(&self, worker: WorkerId, message: impl Into<Message>) -> bool {
+        let event = ToDriver::Event(Peer::Worker(worker), PeerEvent::Said(message.into()));
+        self.events.send(event).await.is_ok()
+    }
 }

@@ -5,10 +5,15 @@
 //! driver task (`driver.rs`) owns it and carries the messages.
 
 mod desk;
+mod tally;
+mod trust;
 
 use crate::blobs::{Broker, ClientId, Order};
-use crate::shots::{FrameHead, Granted, Shots};
+use crate::shots::{Adoption, FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
@@ -39,6 +44,8 @@ pub enum PeerEvent {
     Joined(Greeting),
     /// A message came.
     Said(Message),
+    /// The queue on disk submits a shot.
+    Adopt(Box<Adoption>),
     /// The connection has ended; why, in words.
     Gone(LostReason, String),
 }
@@ -76,6 +83,9 @@ pub struct Farm {
     granted: BTreeMap<LeaseId, Granted>,
     out: VecDeque<Out>,
     pings: u64,
+    /// For those who look at the farm.
+    tally: tally::Tally,
+    trust: trust::Trust,
 }
 
 #[derive(Debug)]
@@ -89,6 +99,7 @@ struct WorkerState {
 impl Farm {
     /// A farm without peers.
     pub fn new(scheduler: terrafarm_sched::Config, seed: u64, blob_memory_bytes: usize) -> Self {
+        let is_auditing = scheduler.audit != Share::NONE;
         Farm {
             scheduler: Scheduler::new(scheduler, seed),
             broker: Broker::new(blob_memory_bytes),
@@ -98,7 +109,15 @@ impl Farm {
             granted: BTreeMap::new(),
             out: VecDeque::new(),
             pings: 0,
+            tally: tally::Tally::default(),
+            trust: trust::Trust::new(is_auditing),
         }
+    }
+
+    /// Numbers shots with a counter that the queue on disk shares.
+    pub fn counted_by(mut self, last_shot: Arc<AtomicU64>) -> Self {
+        self.shots = Shots::counted_by(last_shot);
+        self
     }
 
     /// What to do next; `None` when all is said. Call until then after every other call.
@@ -129,14 +148,19 @@ impl Farm {
             PeerEvent::Joined(greeting) => {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
+                let is_distrusted = self.trust.is_distrusted(&greeting.name);
                 let state =
                     WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
                 self.workers.insert(worker, state);
+                self.tally.joined(worker, now);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
+                if is_distrusted {
+                    self.schedule(now, Event::WorkerDistrusted { worker });
+                }
             }
             PeerEvent::Gone(why, how) => {
                 let held = self.workers.get(&worker).map_or(0, |state| state.leases.len());
-                if let Some(name) = self.forget_worker(worker) {
+                if let Some(name) = self.forget_worker(now, worker) {
                     match why {
                         LostReason::Left => tracing::info!(%worker, %name, "worker left: {how}"),
                         // Nobody waits for it: no reason to alarm anyone.
@@ -150,7 +174,7 @@ impl Farm {
                 self.hear_worker(now, worker, message);
             }
             // It has been dropped; what was still on its way does not count.
-            PeerEvent::Said(_) => {}
+            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -166,6 +190,7 @@ impl Farm {
                 let lease = failed.lease;
                 tracing::warn!(%worker, %lease, "job failed: {}", failed.reason);
                 self.end_lease(worker, lease);
+                self.tally.job_failed(worker);
                 let reason = failed.reason;
                 self.schedule(now, Event::JobFailed { worker, lease, reason });
             }
@@ -175,6 +200,10 @@ impl Farm {
                 }
                 self.schedule(now, Event::WorkerDraining { worker });
                 self.schedule(now, Event::HandedBack { worker, leases: back.leases });
+            }
+            Message::Speed(speed) => {
+                let pixels_per_s = speed.pixels_per_s;
+                self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
             }
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
             Message::Goodbye(goodbye) => {
@@ -204,7 +233,10 @@ impl Farm {
             PeerEvent::Said(message) if self.clients.contains_key(&client) => {
                 self.hear_client(now, client, message);
             }
-            PeerEvent::Said(_) => {}
+            PeerEvent::Adopt(adoption) if self.clients.contains_key(&client) => {
+                self.adopt(now, client, *adoption);
+            }
+            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -267,6 +299,20 @@ impl Farm {
         }
     }
 
+    fn adopt(&mut self, now: Micros, client: ClientId, adoption: Adoption) {
+        let number = adoption.submit.number;
+        match self.shots.adopt(client, adoption, now) {
+            Ok((accepted, event)) => {
+                self.send(Peer::Client(client), accepted);
+                self.schedule(now, event);
+            }
+            Err(why) => {
+                let reason = clip_reason(&why);
+                self.send(Peer::Client(client), Rejected { number, reason });
+            }
+        }
+    }
+
     fn want_blobs(&mut self, worker: WorkerId, want: &WantBlobs) {
         let opened = self.workers.get(&worker).map(|state| &state.opened);
         let owners: BTreeSet<_> = opened
@@ -313,6 +359,7 @@ impl Farm {
                     Ok(pixels) => Some(pixels),
                     Err(why) => {
                         self.end_lease(worker, lease);
+                        self.tally.job_failed(worker);
                         let reason = format!("unusable result: {why}");
                         self.schedule(now, Event::JobFailed { worker, lease, reason });
                         return;
@@ -323,18 +370,24 @@ impl Farm {
             None => None,
         };
         let cost_us = done.report.cost_us;
-        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us });
+        let digest = pixels.as_deref().map_or(0, |pixels| self.trust.digest(pixels));
+        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us, digest });
         let verdict = self.scheduler.poll_action();
         match (verdict, pixels) {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
                 let name =
                     self.workers.get(&worker).map_or("", |state| state.greeting.name.as_str());
                 self.shots.count_time(shot, name, &done.timesheet, now);
+                self.tally.job_done(worker, &done.timesheet);
                 let (report, check) = (&done.report, done.check.as_ref());
                 self.shots.count_job(shot, frame, name, report, check);
                 if let Err(why) = self.shots.merge(shot, frame, region, &pixels) {
                     tracing::error!(%shot, "cannot merge pixels: {why}");
                 }
+            }
+            (Some(Action::Compared { agrees, .. }), _) => {
+                let shot = granted.map(|granted| granted.shot);
+                self.count_audit(now, worker, shot, agrees, &done.timesheet);
             }
             (Some(Action::Refuse { why, .. }), _) => {
                 tracing::info!(%worker, %lease, ?why, "late result refused");
@@ -357,6 +410,7 @@ impl Farm {
         shot: Option<ShotId>,
         sheet: &Timesheet,
     ) {
+        self.tally.wasted(worker, &sheet.wasted());
         let Some(state) = self.workers.get(&worker) else { return };
         let mut opened = state.opened.iter().copied();
         let only = opened.next().filter(|_| opened.next().is_none());
@@ -376,6 +430,17 @@ impl Farm {
             match action {
                 Action::Grant { worker, lease, shot, frame, region } => {
                     self.grant(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Audit { worker, lease, shot, frame, region, .. } => {
+                    self.send_job(now, Granted { worker, shot, frame, region }, lease);
+                }
+                Action::Retract { shot, frame, region, .. } => {
+                    self.shots.retract(shot, frame, region);
+                }
+                Action::Distrusted { worker, why, sent } => self.distrust(worker, &why, &sent),
+                Action::Trusted { worker } => self.trust_again(worker),
+                Action::Disputed { shot, frame, region, workers } => {
+                    self.report_dispute(shot, frame, region, &workers);
                 }
                 Action::Revoke { worker, lease } => {
                     self.end_lease(worker, lease);
@@ -410,17 +475,19 @@ impl Farm {
                     self.send(Peer::Worker(worker), Ping { number });
                 }
                 Action::Drop { worker, why } => {
-                    let name = self.forget_worker(worker).unwrap_or_default();
+                    let name = self.forget_worker(now, worker).unwrap_or_default();
                     tracing::warn!(%worker, %name, "worker dropped: {why}");
                     self.out.push_back(Out::Close(Peer::Worker(worker), why.to_string()));
                 }
                 Action::Blocked { worker, shot } => {
+                    self.tally.blocked(worker, shot, true);
                     tracing::warn!(%worker, %shot, "worker failed too often and gets no more of this shot");
                 }
                 Action::Unblocked { worker, shot } => {
+                    self.tally.blocked(worker, shot, false);
                     tracing::info!(%worker, %shot, "worker gets jobs of this shot again");
                 }
-                Action::Accept { .. } | Action::Refuse { .. } => {
+                Action::Accept { .. } | Action::Compared { .. } | Action::Refuse { .. } => {
                     tracing::error!(?action, "a verdict without a result");
                 }
             }
@@ -428,9 +495,19 @@ impl Farm {
     }
 
     fn grant(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
+        let Granted { worker, shot, frame, .. } = granted;
+        if self.shots.begin_frame(shot, frame, now).is_none() {
+            tracing::error!(%shot, %worker, "a job for nobody");
+            return;
+        }
+        self.send_job(now, granted, lease);
+    }
+
+    /// Sends a job to its worker, which is told of the shot first.
+    fn send_job(&mut self, now: Micros, granted: Granted, lease: LeaseId) {
         let Granted { worker, shot, frame, region } = granted;
         let (Some(state), Some(worker_state)) =
-            (self.shots.begin_frame(shot, frame, now), self.workers.get_mut(&worker))
+            (self.shots.get(shot), self.workers.get_mut(&worker))
         else {
             tracing::error!(%shot, %worker, "a job for nobody");
             return;
@@ -460,6 +537,7 @@ impl Farm {
     }
 
     fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {
+        self.tally.frame_done(shot, frame, now);
         match self.shots.finish_frame(shot, frame, now) {
             Some((client, head, picture)) => {
                 self.out.push_back(Out::SendFrame(client, head, picture));
@@ -492,8 +570,9 @@ impl Farm {
     }
 
     /// Returns the worker's name if it was known.
-    fn forget_worker(&mut self, worker: WorkerId) -> Option<String> {
+    fn forget_worker(&mut self, now: Micros, worker: WorkerId) -> Option<String> {
         self.broker.worker_gone(worker);
+        self.tally.left(worker, now);
         let state = self.workers.remove(&worker)?;
         for lease in &state.leases {
             self.granted.remove(lease);
@@ -502,6 +581,7 @@ impl Farm {
     }
 
     fn forget_shot(&mut self, shot: ShotId) {
+        self.tally.forget_shot(shot);
         if self.shots.remove(shot).is_none() {
             return;
         }

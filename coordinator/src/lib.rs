@@ -6,15 +6,19 @@
 //! the other side: it submits a shot, supplies terrain, and takes frames. [`sink`] writes
 //! frames to files.
 
+pub mod api;
+pub mod ask;
 mod blobs;
 pub mod client;
 mod driver;
 mod farm;
 pub mod order;
 mod peer;
+pub mod queue;
 mod shots;
 pub mod sink;
 mod strangers;
+mod thumbnails;
 pub mod view;
 
-pub use driver::{Config, CoordinatorError, run};
+pub use driver::{Config, CoordinatorError, run, run_with_page};

@@ -1,15 +1,17 @@
 //! One connection: greeting, then one task that reads and one that writes.
 
+use crate::api;
 use crate::driver::{Config, ToDriver, peer_of};
 use crate::farm::{Greeting, PeerEvent};
 use crate::strangers::Strangers;
+use axum::Router;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, HandshakeError, LinkError, Trust, handshake};
-use terrafarm_wire::message::{Message, Role};
+use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Trust, handshake};
+use terrafarm_wire::message::{Message, Pong, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_util::sync::CancellationToken;
@@ -21,6 +23,11 @@ const BULK_QUEUE: usize = 4096;
 
 /// A client is given up after this many times the silence that a worker may keep.
 const CLIENT_PATIENCE: u32 = 4;
+
+/// Desks at once: each may be sending something long.
+const DESKS_MAX: usize = 32;
+/// How long a desk may take to take an answer.
+const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 
 /// What every new connection needs to know.
 #[derive(Clone)]
@@ -34,6 +41,10 @@ pub struct Admission {
     strangers: Arc<Strangers>,
     last_id: Arc<AtomicU64>,
     events: mpsc::Sender<ToDriver>,
+    /// What answers desks, and how many more there may be.
+    api: Router,
+    desks: Arc<Semaphore>,
+    stop: CancellationToken,
 }
 
 /// What the driver has to know of a peer.
@@ -46,7 +57,12 @@ pub struct PeerTraits {
 
 impl Admission {
     /// Lets in as many peers as the configuration says.
-    pub fn new(config: &Config, events: mpsc::Sender<ToDriver>) -> Self {
+    pub fn new(
+        config: &Config,
+        events: mpsc::Sender<ToDriver>,
+        api: Router,
+        stop: CancellationToken,
+    ) -> Self {
         Admission {
             name: config.name.as_str().into(),
             greeting_limit: config.greeting_limit,
@@ -57,6 +73,9 @@ impl Admission {
             strangers: Arc::new(Strangers::new(config.strangers_max)),
             last_id: Arc::default(),
             events,
+            api,
+            desks: Arc::new(Semaphore::new(DESKS_MAX)),
+            stop,
         }
     }
 
@@ -94,8 +113,7 @@ pub async fn serve(
     let (is_worker, threads) = match hello.role {
         Role::Worker { threads, .. } => (true, threads),
         Role::Client => (false, 0),
-        // Answered by the API, which is not there yet.
-        Role::Desk => return,
+        Role::Desk => return desk(connection, &admission).await,
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();
@@ -143,6 +161,31 @@ pub async fn serve(
     let mut writing = writing;
     if tokio::time::timeout(admission.greeting_limit, &mut writing).await.is_err() {
         writing.abort();
+    }
+}
+
+/// Answers the requests of one desk, one after the other.
+async fn desk(connection: Connection<TcpStream>, admission: &Admission) {
+    // Whoever comes when all places are taken is hung up on, and tries again.
+    let Ok(_place) = admission.desks.try_acquire() else { return };
+    let (mut reader, mut writer) = connection.split();
+    let patience = admission.silence * CLIENT_PATIENCE;
+    loop {
+        let received = tokio::select! {
+            () = admission.stop.cancelled() => return,
+            received = reader.recv_within(patience) => received,
+        };
+        let answer: Message = match received {
+            Ok(Some(Message::Request(request))) => {
+                api::answer(&admission.api, request).await.into()
+            }
+            Ok(Some(Message::Ping(ping))) => Pong { number: ping.number }.into(),
+            _ => return,
+        };
+        match tokio::time::timeout(ANSWER_LIMIT, writer.send(&answer)).await {
+            Ok(Ok(())) => {}
+            _ => return,
+        }
     }
 }
 

@@ -2,13 +2,15 @@
 
 use crate::blobs::ClientId;
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use terrafarm_common::accuracy::Summary;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::region::Region;
 use terrafarm_film::{Film, FilmError, Merge};
-use terrafarm_sched::{Event, Micros};
+use terrafarm_sched::{Event, MAX_SHOTS, Micros};
 use terrafarm_wire::limits::WORKER_SHARES_MAX;
 use terrafarm_wire::message::{
     Accepted, Cameras, Frame, RenderReport, ShotDone, Submit, Timesheet, WorkerShare,
@@ -39,6 +41,8 @@ pub struct Granted {
 pub struct Shot {
     /// Whose it is.
     pub client: ClientId,
+    /// Whether it is one of the queue on disk.
+    pub queued: bool,
     /// What was submitted.
     pub submit: Submit,
     /// One camera a frame, as far as they have arrived.
@@ -61,6 +65,21 @@ pub struct Shot {
     shares: BTreeMap<String, WorkerShare>,
 }
 
+impl Shot {
+    /// What the scheduler is told of it.
+    fn submitted(&self, id: ShotId) -> Event {
+        Event::ShotSubmitted {
+            shot: id,
+            frames: self.submit.frames,
+            width: self.submit.width,
+            height: self.submit.height,
+            split: self.submit.split,
+            priority: self.submit.priority,
+            frames_in_flight: self.submit.frames_in_flight,
+        }
+    }
+}
+
 /// A frame on its way.
 #[derive(Debug)]
 pub struct OpenFrame {
@@ -75,7 +94,8 @@ pub struct OpenFrame {
 #[derive(Debug, Default)]
 pub struct Shots {
     shots: BTreeMap<ShotId, Shot>,
-    last: u64,
+    /// The last number given to a shot; the queue on disk counts with the same counter.
+    last: Arc<AtomicU64>,
     cameras: u64,
     film_bytes: u64,
 }
@@ -85,7 +105,23 @@ fn film_bytes(submit: &Submit) -> u64 {
     u64::from(submit.width) * u64::from(submit.height) * 3 * u64::from(submit.frames_in_flight)
 }
 
+/// A shot of the queue on disk, which has its number already.
+#[derive(Debug)]
+pub struct Adoption {
+    /// Its number.
+    pub shot: ShotId,
+    /// What is to be rendered.
+    pub submit: Submit,
+    /// One camera a frame.
+    pub cameras: Vec<Camera>,
+}
+
 impl Shots {
+    /// No shots; the next one gets the number after the counter's.
+    pub fn counted_by(last: Arc<AtomicU64>) -> Self {
+        Shots { last, ..Shots::default() }
+    }
+
     /// A shot.
     pub fn get(&self, shot: ShotId) -> Option<&Shot> {
         self.shots.get(&shot)
@@ -124,13 +160,49 @@ impl Shots {
         if own.len() >= SHOTS_PER_CLIENT {
             return Err(format!("{SHOTS_PER_CLIENT} shots of this client are under way already"));
         }
+        self.check_room(&submit)?;
+        let id = ShotId(self.last.fetch_add(1, Ordering::Relaxed) + 1);
+        self.insert(id, client, submit, now);
+        Ok(())
+    }
+
+    /// Takes a shot of the queue on disk, with all its cameras: it begins at once.
+    ///
+    /// # Errors
+    /// If there is no room for it now, in words for the user.
+    pub fn adopt(
+        &mut self,
+        client: ClientId,
+        adoption: Adoption,
+        now: Micros,
+    ) -> Result<(Accepted, Event), String> {
+        let Adoption { shot, submit, cameras } = adoption;
+        if self.shots.contains_key(&shot) {
+            return Err(format!("{shot} is under way already"));
+        }
+        if self.shots.len() >= MAX_SHOTS {
+            return Err(format!("{MAX_SHOTS} shots are under way already"));
+        }
+        self.check_room(&submit)?;
+        let (number, size) = (submit.number, (submit.width, submit.height));
+        let sized = cameras.iter().all(|camera| (camera.width, camera.height) == size);
+        if cameras.len() != submit.frames as usize || !sized {
+            return Err("the cameras do not fit the shot".into());
+        }
+        let state = self.insert(shot, client, submit, now);
+        state.queued = true;
+        state.cameras = cameras;
+        Ok((Accepted { number, shot }, state.submitted(shot)))
+    }
+
+    fn check_room(&self, submit: &Submit) -> Result<(), String> {
         if self.cameras + u64::from(submit.frames) > CAMERAS_MAX {
             return Err(format!(
                 "the farm holds {} frames and takes {CAMERAS_MAX} at most; submit again later",
                 self.cameras
             ));
         }
-        let film = film_bytes(&submit);
+        let film = film_bytes(submit);
         if self.film_bytes.saturating_add(film) > FILM_BYTES_MAX {
             return Err(format!(
                 "{} frames of {} x {} pixels in flight need {} MiB of the coordinator's memory, and {} \
@@ -142,11 +214,15 @@ impl Shots {
                 (FILM_BYTES_MAX - self.film_bytes) >> 20
             ));
         }
-        self.film_bytes += film;
+        Ok(())
+    }
+
+    fn insert(&mut self, id: ShotId, client: ClientId, submit: Submit, now: Micros) -> &mut Shot {
+        self.film_bytes += film_bytes(&submit);
         self.cameras += u64::from(submit.frames);
-        self.last += 1;
         let shot = Shot {
             client,
+            queued: false,
             cameras: Vec::new(),
             since: now,
             progress_at: now,
@@ -160,8 +236,7 @@ impl Shots {
             shares: BTreeMap::new(),
             submit,
         };
-        self.shots.insert(ShotId(self.last), shot);
-        Ok(())
+        self.shots.entry(id).insert_entry(shot).into_mut()
     }
 
     /// Adds cameras to a submission; when the last one is there, the shot begins.
@@ -196,16 +271,7 @@ impl Shots {
         if shot.cameras.len() < total {
             return Ok(None);
         }
-        let event = Event::ShotSubmitted {
-            shot: id,
-            frames: shot.submit.frames,
-            width: shot.submit.width,
-            height: shot.submit.height,
-            split: shot.submit.split,
-            priority: shot.submit.priority,
-            frames_in_flight: shot.submit.frames_in_flight,
-        };
-        Ok(Some((Accepted { number, shot: id }, event)))
+        Ok(Some((Accepted { number, shot: id }, shot.submitted(id))))
     }
 
     /// A job of a frame is granted: the frame is open from the first one on.
@@ -301,6 +367,14 @@ impl Shots {
         Ok(())
     }
 
+    /// Forgets pixels that were merged into an open frame; they will come again.
+    pub fn retract(&mut self, shot: ShotId, frame: FrameIndex, region: Region) {
+        let Some(state) = self.shots.get_mut(&shot) else { return };
+        if !state.film.retract(frame, region) {
+            tracing::error!(%shot, frame, ?region, "pixels to take back that are not there");
+        }
+    }
+
     /// A frame is complete: its message (still without pixels) and its picture.
     pub fn finish_frame(
         &mut self,
@@ -368,6 +442,11 @@ pub struct FrameHead {
 }
 
 impl FrameHead {
+    /// Which frame of which shot.
+    pub fn place(&self) -> (ShotId, FrameIndex) {
+        (self.shot, self.frame)
+    }
+
     /// The message with its pixels.
     pub fn with(self, pixels: terrafarm_wire::pixels::Pixels) -> Frame {
         let FrameHead { shot, frame, jobs, report, check, elapsed_us } = self;

@@ -138,6 +138,8 @@ pub struct ShotView {
     pub priority: i32,
     /// Whether it is in the queue on disk; else it ends with the client that submitted it.
     pub queued: bool,
+    /// Number of the first frame within the flight; frames are named by such numbers.
+    pub first_frame: FrameIndex,
     /// Number of frames.
     pub frames: u32,
     /// Frames finished.
@@ -156,4 +158,48 @@ pub struct ShotView {
     pub eta_s: Option<f64>,
     /// The frame that was finished last, if any.
     pub last_frame: Option<FrameIndex>,
+}
+
+impl ShotState {
+    /// Every state.
+    pub const ALL: [ShotState; 8] = [
+        ShotState::Waiting,
+        ShotState::Running,
+        ShotState::Paused,
+        ShotState::Stalled,
+        ShotState::Finishing,
+        ShotState::Done,
+        ShotState::Failed,
+        ShotState::Canceled,
+    ];
+
+    /// Its name, as in JSON.
+    pub fn name(self) -> &'static str {
+        match self {
+            ShotState::Waiting => "waiting",
+            ShotState::Running => "running",
+            ShotState::Paused => "paused",
+            ShotState::Stalled => "stalled",
+            ShotState::Finishing => "finishing",
+            ShotState::Done => "done",
+            ShotState::Failed => "failed",
+            ShotState::Canceled => "canceled",
+        }
+    }
+
+    /// Whether nothing will change any more.
+    pub fn is_over(self) -> bool {
+        matches!(self, ShotState::Done | ShotState::Failed | ShotState::Canceled)
+    }
+}
+
+impl WorkerState {
+    /// Its name, as in JSON.
+    pub fn name(self) -> &'static str {
+        match self {
+            WorkerState::Idle => "idle",
+            WorkerState::Busy => "busy",
+            WorkerState::Draining => "draining",
+        }
+    }
 }

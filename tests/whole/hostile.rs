@@ -27,7 +27,7 @@ fn guarded(dir: &Dir) -> Guarded {
     let token_file = dir.path("farm.token");
     let mut running = Running::start(
         terrafarm()
-            .args(["-v", "coordinator", "--listen", "127.0.0.1:0", "--token-file"])
+            .args(["-v", "coordinator", "--listen", "127.0.0.1:0", "--no-http", "--token-file"])
             .arg(&token_file),
     );
     let address = running.expect("coordinator on ").rsplit(' ').next().unwrap().to_owned();

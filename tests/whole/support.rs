@@ -212,7 +212,8 @@ pub fn coordinator() -> (Running, String) {
 
 /// A coordinator of its own process at an address, and the address with its port.
 pub fn coordinator_on(listen: &str) -> (Running, String) {
-    let mut running = Running::start(terrafarm().args(["-v", "coordinator", "--listen", listen]));
+    let mut running =
+        Running::start(terrafarm().args(["-v", "coordinator", "--listen", listen, "--no-http"]));
     let line = running.expect("coordinator on ");
     let address = line.rsplit(' ').next().unwrap().to_owned();
     (running, address)

@@ -5,7 +5,7 @@
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
 //! the session asks for over one connection; [`office`] says when and with how many threads
 //! a worker on somebody's PC works; `backoff` says when to try again, `clock` where the
-//! time goes. A [`sleeper`]
+//! time goes, `trial` how fast this PC is. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
@@ -21,6 +21,7 @@ pub mod session;
 mod shift;
 pub mod sleeper;
 pub mod terrain;
+mod trial;
 
 pub use backoff::Reconnect;
 pub use render::{Caster, RayCaster};
@@ -29,6 +30,7 @@ use backoff::Backoff;
 use office::{Gate, Rules, Watch};
 use shift::{Shift, Site};
 use std::net::SocketAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -38,7 +40,7 @@ use terrafarm_wire::message::{Hello, Role, Welcome};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 
 /// How long connecting may take, and the greeting after it.
 const CONNECT_LIMIT: Duration = Duration::from_secs(10);
@@ -232,7 +234,18 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
         }
     };
     let terrain = terrain::Terrain::new(config.memory_limit_bytes);
-    Ok(Site { pool, cache, terrain, caster: Arc::new(caster), gate: Gate::new(threads) })
+    let caster = Arc::new(caster);
+    let (tried, trial) = tokio::sync::oneshot::channel();
+    let on_trial = caster.clone();
+    pool.spawn(move || {
+        // A trial that panics says as much as none.
+        let speed = catch_unwind(AssertUnwindSafe(|| on_trial.trial()));
+        let _unheard = tried.send(speed.ok().flatten());
+    });
+    let pixels_per_s = trial.await.ok().flatten();
+    debug!(pixels_per_s, "tried how fast this worker is");
+    let gate = Gate::new(threads);
+    Ok(Site { pool, cache, terrain, caster, gate, pixels_per_s })
 }
 
 type Connected = (Connection<Paced<TcpStream>>, Welcome, SocketAddr);

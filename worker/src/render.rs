@@ -66,6 +66,12 @@ pub trait Caster: Send + Sync + 'static {
         x: u32,
         y: u32,
     ) -> Result<PixelError, Unseen>;
+
+    /// Tries how many pixels it renders in a second on the thread pool that it is called on;
+    /// `None` if that would say nothing.
+    fn trial(&self) -> Option<u64> {
+        None
+    }
 }
 
 /// The terrain as a job sees it.
@@ -119,6 +125,10 @@ impl Caster for RayCaster {
         let claimed = found.distance_m(view, x, y);
         measure(resident, pyramid, view, x, y, claimed)
             .map_err(|Missing(tiles)| Unseen::Missing(tiles))
+    }
+
+    fn trial(&self) -> Option<u64> {
+        crate::trial::pixels_per_s()
     }
 }
 

@@ -27,7 +27,7 @@ use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
 use terrafarm_wire::message::{
-    Blob, Done, Grant, OpenShot, Pong, RenderReport, Timesheet, Welcome,
+    Blob, Done, Grant, OpenShot, Pong, RenderReport, Speed, Timesheet, Welcome,
 };
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -49,6 +49,8 @@ pub(crate) struct Site<C: Caster> {
     pub terrain: Terrain<C::Prepared>,
     pub caster: Arc<C>,
     pub gate: Gate,
+    /// What a trial said of its speed.
+    pub pixels_per_s: Option<u64>,
 }
 
 /// What the thread pool has done.
@@ -115,6 +117,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         let (mut reader, writer) = connection.split();
         let (outbox, queues) = outbox(URGENT_MAX, BULK_MAX);
         let mut writing = tokio::spawn(writer.run(queues));
+        if let Some(pixels_per_s) = self.site.pixels_per_s {
+            outbox.send(Speed { pixels_per_s }).await?;
+        }
         let mut asked_to_stop = false;
         while !(self.ended && self.backlog.is_empty()) {
             let waiting = self.backlog.front().cloned();

@@ -23,7 +23,8 @@ pub use shot::{
     ShotFailed, Submit, WorkerShare,
 };
 pub use work::{
-    CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Timesheet,
+    CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Speed,
+    Timesheet,
 };
 
 use crate::limits::{Class, NAME_BYTES_MAX, REASON_BYTES_MAX};
@@ -253,6 +254,8 @@ messages! {
     Failed = 0x31, Control;
     /// Worker to coordinator: jobs not begun.
     HandBack = 0x32, Control;
+    /// Worker to coordinator: how fast it is.
+    Speed = 0x33, Control;
 
     /// Client to coordinator: a new shot.
     Submit = 0x40, Submission;

@@ -17,7 +17,7 @@ mod clock;
 mod core;
 mod kernel;
 mod land;
-mod report;
+pub(super) mod report;
 mod scale_out;
 mod speed_accuracy;
 mod stability;

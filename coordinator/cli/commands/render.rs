@@ -101,7 +101,7 @@ fn print_check(errors: &Summary) {
 }
 
 /// A scene file, or a bare store with the light that a scene has by default.
-fn read_scene(path: &Path) -> anyhow::Result<Scene> {
+pub(super) fn read_scene(path: &Path) -> anyhow::Result<Scene> {
     if path.extension().is_some_and(|extension| extension == "terrain") {
         // What a scene file of this one line would say.
         let name = path.file_name().unwrap_or_default().to_string_lossy();

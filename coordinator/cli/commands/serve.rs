@@ -4,10 +4,12 @@ use crate::secret::{self, Source};
 use crate::{Outcome, args, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
+use terrafarm_coordinator::api::{Access, Web, WebKey};
+use terrafarm_coordinator::queue::QueueConfig;
 use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::office::Rules;
 use terrafarm_worker::{Reconnect, WorkerConfig};
@@ -16,26 +18,36 @@ use tokio::net::{TcpListener, TcpStream};
 const MIB: u64 = 1 << 20;
 /// How long the network is listened to before this PC is looked at again.
 const SEARCH: Duration = Duration::from_secs(3);
+/// Where the page is, unless told otherwise.
+const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7879);
 
 /// Serves a farm until Ctrl-C or SIGTERM.
 pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
-    let (trust, source) = secret::to_serve(&args.security, !is_this_pc(address.ip()))?;
+    let web = args.web.http.unwrap_or(HTTP);
+    let reachable = !is_this_pc(address.ip()) || !(args.web.no_http || is_this_pc(web.ip()));
+    let (trust, source) = secret::to_serve(&args.security, reachable)?;
     runtime()?.block_on(async {
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; is another coordinator running there?")
         })?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
+        let web = listen_http(&args.web, &trust).await?;
         announce(address, &trust, source.as_ref());
         let _announced = announce_on_lan(args, address);
+        if let Some(web) = &web {
+            say_where(web)?;
+        }
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             trust,
+            queue: args.data.as_deref().map(QueueConfig::new),
+            scheduler: terrafarm_sched::Config { audit: args.audit, ..Default::default() },
             ..Config::default()
         };
         let stop = stop_signal();
         notify::ready(&format!("listening on {address}"));
-        terrafarm_coordinator::run(config, listener, told(stop)).await?;
+        terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
         Ok(Outcome::Done)
     })
 }
@@ -52,6 +64,52 @@ fn announce_on_lan(args: &args::Coordinator, address: SocketAddr) -> Option<lan:
             None
         }
     }
+}
+
+/// The socket of the page, and who may use it. A port that is taken is an error only if it
+/// was asked for.
+async fn listen_http(args: &args::queue::Web, trust: &Trust) -> anyhow::Result<Option<Web>> {
+    if args.no_http {
+        return Ok(None);
+    }
+    let address = args.http.unwrap_or(HTTP);
+    let listener = match TcpListener::bind(address).await {
+        Ok(listener) => listener,
+        Err(error) if args.http.is_none() => {
+            eprintln!(
+                "terrafarm: warning: no page, since {address} cannot be listened on: {error}; \
+                 --http names another address, --no-http goes without"
+            );
+            return Ok(None);
+        }
+        Err(error) => {
+            return Err(error).with_context(|| format!("cannot serve the page on {address}"));
+        }
+    };
+    let key = match trust {
+        Trust::Token(token) if args.http_key || !is_this_pc(address.ip()) => {
+            Some(WebKey::of(token))
+        }
+        Trust::Loopback | Trust::Network if args.http_key => bail!(
+            "--http-key: there is no farm token to derive a key from; make one with \
+             \"terrafarm token\", and do not say --plain"
+        ),
+        _ => None,
+    };
+    let names = args.http_names.iter().cloned().chain([pc_name()]).collect();
+    Ok(Some(Web { listener, access: Access { key, names } }))
+}
+
+/// Says where the page is.
+fn say_where(web: &Web) -> anyhow::Result<()> {
+    let address = web.listener.local_addr().context("cannot read the address of the page")?;
+    let host = match address.ip().is_unspecified() {
+        true => format!("{}:{}", pc_name(), address.port()),
+        false => address.to_string(),
+    };
+    let key = if web.access.key.is_some() { "  (key: terrafarm token --web)" } else { "" };
+    println!("look at it:          http://{host}/{key}");
+    Ok(())
 }
 
 /// Says where the coordinator listens, and the exact lines that others need. The token

@@ -3,6 +3,7 @@
 use crate::{Outcome, args, secret};
 use anyhow::{Context, bail};
 use std::io::BufRead;
+use terrafarm_coordinator::api::WebKey;
 use terrafarm_wire::link::FarmToken;
 
 /// Longest line that is read, bytes.
@@ -19,7 +20,11 @@ pub fn run(args: &args::Token) -> anyhow::Result<Outcome> {
             Some(token) => token,
             None => secret::make(&path)?,
         };
-        println!("{}", token.to_text());
+        if args.web {
+            println!("{}", WebKey::of(&token).as_text());
+        } else {
+            println!("{}", token.to_text());
+        }
         return Ok(Outcome::Done);
     }
     let token = enter()?;

@@ -46,6 +46,16 @@ impl Coverage {
         self.missing_px -= region.area();
     }
 
+    /// Marks a region inside the frame, all of which was there, as missing.
+    pub(crate) fn remove(&mut self, region: Region) {
+        for row in region.y as usize..(region.y + region.height) as usize {
+            for (word, mask) in self.words(row, region) {
+                self.bits[word] &= !mask;
+            }
+        }
+        self.missing_px += region.area();
+    }
+
     /// The words that a region touches in a row, each with the bits that belong to it.
     fn words(&self, row: usize, region: Region) -> impl Iterator<Item = (usize, u64)> + use<> {
         let (left, right) = (region.x, region.x + region.width);
@@ -84,6 +94,9 @@ mod tests {
                 if count == 0 {
                     coverage.add(region);
                     rows.iter().for_each(|&at| there[at] = true);
+                } else if count == region.area() {
+                    coverage.remove(region);
+                    rows.iter().for_each(|&at| there[at] = false);
                 }
                 let missing = there.iter().filter(|there| !**there).count() as u64;
                 prop_assert_eq!(coverage.missing_px(), missing);

@@ -172,6 +172,18 @@ impl Film {
         Ok(Merge::Complete(whole.picture))
     }
 
+    /// Forgets pixels of an open frame, as if they had not been merged. Whether all of them
+    /// were there; nothing is changed otherwise.
+    pub fn retract(&mut self, frame: FrameIndex, region: Region) -> bool {
+        let Some(open) = self.open.get_mut(&frame) else { return false };
+        let is_there = region.fits(open.picture.width(), open.picture.height())
+            && open.coverage.count(region) == region.area();
+        if is_there {
+            open.coverage.remove(region);
+        }
+        is_there
+    }
+
     /// Throws an open frame away; whether there was one.
     pub fn discard(&mut self, frame: FrameIndex) -> bool {
         self.open.remove(&frame).is_some()
@@ -283,6 +295,20 @@ mod tests {
             panic!("the frame is whole")
         };
         assert_eq!((whole.get(3, 0), whole.get(4, 0)), ([1; 3], [3; 3]));
+    }
+
+    #[test]
+    fn what_is_taken_back_can_be_merged_again() {
+        let mut film = Film::new(1);
+        film.open(0, 2, 1).unwrap();
+        let [left, right] = [0, 1].map(|x| Region { x, y: 0, width: 1, height: 1 });
+        film.merge(0, left, &[1; 3]).unwrap();
+        assert!(!film.retract(0, Region::whole(2, 1)), "half of it is not there");
+        assert!(!film.retract(0, Region::whole(9, 9)) && !film.retract(1, left));
+        assert!(film.retract(0, left) && !film.retract(0, left));
+        assert_eq!(film.merge(0, right, &[3; 3]), Ok(Merge::Partial { missing_px: 1 }));
+        let Ok(Merge::Complete(picture)) = film.merge(0, left, &[2; 3]) else { panic!() };
+        assert_eq!(picture.pixels(), [2, 2, 2, 3, 3, 3]);
     }
 
     #[test]

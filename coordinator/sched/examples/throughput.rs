@@ -75,7 +75,7 @@ fn main() {
         }
         let Some((at, worker, lease)) = answers.pop_front() else { continue };
         now = at.max(now);
-        tell(&mut scheduler, now, Event::JobDone { worker, lease, cost_us: JOB_US });
+        tell(&mut scheduler, now, Event::JobDone { worker, lease, cost_us: JOB_US, digest: 0 });
     }
     let jobs = scheduler.account().accepted;
     let seconds = began.elapsed().as_secs_f64();

@@ -12,6 +12,7 @@ impl Scheduler {
     pub fn check_invariants(&self) -> Result<(), String> {
         let account = self.account;
         let ended = account.accepted
+            + account.audited
             + account.failed
             + account.expired
             + account.handed_back
@@ -22,6 +23,7 @@ impl Scheduler {
         })?;
         self.check_leases()?;
         self.check_workers()?;
+        self.audits.check()?;
         self.shots.keys().try_for_each(|&shot| self.check_shot(shot))
     }
 
@@ -32,10 +34,13 @@ impl Scheduler {
             ensure(holder.is_some_and(|worker| worker.held.contains(id)), || {
                 format!("{id} is held by {}, who does not hold it", lease.worker)
             })?;
-            let job = self
-                .shots
-                .get(&lease.shot)
-                .and_then(|shot| shot.running.get(&(lease.frame, lease.start)));
+            if let Some(audit) = lease.audit {
+                ensure(self.audits.holds(audit, *id) && lease.late_at.is_none(), || {
+                    format!("{id} is for no audit, or is to be hedged")
+                })?;
+                continue;
+            }
+            let job = self.shots.get(&lease.shot).and_then(|shot| shot.job_of(lease));
             let Some(job) = job else { return Err(format!("{id} is for no running job")) };
             ensure(job.leases.contains(id), || format!("the job of {id} does not know it"))?;
             ensure((job.leases.len() == 1) == lease.late_at.is_some(), || {
@@ -48,7 +53,7 @@ impl Scheduler {
 
     /// The sums and the sets agree with the workers.
     fn check_workers(&self) -> Result<(), String> {
-        let active = self.workers.values().filter(|worker| !worker.is_draining);
+        let active = self.workers.values().filter(|worker| worker.is_active());
         let speed: f64 = active.clone().map(|worker| worker.speed.value()).sum();
         ensure(active.clone().count() == self.active, || "wrong number of active workers".into())?;
         ensure(speed == self.active_speed, || {
@@ -57,7 +62,10 @@ impl Scheduler {
         for (id, worker) in &self.workers {
             let is_hungry = worker.hunger.is_some_and(|key| self.hungry.contains(&key));
             ensure(is_hungry == worker.hunger.is_some(), || format!("{id} has a stale hunger"))?;
-            ensure(!(worker.is_draining && is_hungry), || format!("{id} drains and is hungry"))?;
+            ensure(worker.is_active() || !is_hungry, || format!("{id} is out and hungry"))?;
+            ensure(!worker.is_distrusted || worker.held.is_empty(), || {
+                format!("{id} is distrusted and holds jobs")
+            })?;
             let held = worker.held.len();
             ensure(held <= self.config.max_held.max(self.config.queue_depth + 1), || {
                 format!("{id} holds {held} jobs")
@@ -89,6 +97,9 @@ impl Scheduler {
         })?;
         ensure(shot.running.values().all(|job| matches!(job.leases.len(), 1 | 2)), || {
             format!("a job of {id} runs under no lease or more than two")
+        })?;
+        ensure(shot.audits as usize == self.audits.of(id), || {
+            format!("{id} counts {} audits", shot.audits)
         })?;
         let mut places: BTreeMap<(u32, u32), u32> = BTreeMap::new();
         for (&(frame, start), job) in shot.waiting.iter().chain(&shot.running) {

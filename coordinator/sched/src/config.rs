@@ -1,6 +1,7 @@
 //! What can be tuned, and the limits that cannot.
 
 use serde::{Deserialize, Serialize};
+use terrafarm_common::accuracy::Share;
 
 /// The most workers connected at once; more are dropped as they join.
 pub const MAX_WORKERS: usize = 16_384;
@@ -38,6 +39,9 @@ pub struct Config {
     pub heartbeat_us: u64,
     /// A worker that has been silent this long is dropped, microseconds.
     pub silence_us: u64,
+    /// How many of the accepted jobs are rendered again by another worker and compared:
+    /// this much of the farm's work. See `audit.rs`.
+    pub audit: Share,
 }
 
 impl Default for Config {
@@ -52,6 +56,7 @@ impl Default for Config {
             lease_floor_us: 10_000_000,
             heartbeat_us: 1_000_000,
             silence_us: 5_000_000,
+            audit: Share::NONE,
         }
     }
 }

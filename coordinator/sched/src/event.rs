@@ -32,8 +32,17 @@ pub enum Event {
     WorkerJoined {
         /// A connection that has not been used before.
         worker: WorkerId,
-        /// Threads it renders with: the first guess of its speed.
+        /// Threads it renders with: the first guess of its speed, until
+        /// [`Event::WorkerMeasured`].
         threads: u32,
+    },
+    /// When a worker has said how fast it rendered something that is the same for all: a
+    /// better first guess than its threads. Changes nothing after its first job.
+    WorkerMeasured {
+        /// The worker.
+        worker: WorkerId,
+        /// Pixels in a second; only compared with those of others.
+        pixels_per_s: u64,
     },
     /// When a connection has ended. What the worker held is granted anew at once.
     WorkerLost {
@@ -74,8 +83,8 @@ pub enum Event {
         /// [`crate::MAX_FRAMES_IN_FLIGHT`]: the bound on the coordinator's memory.
         frames_in_flight: u32,
     },
-    /// When pixels of the right number have arrived. Answered by [`Action::Accept`] or
-    /// [`Action::Refuse`] before any other action.
+    /// When pixels of the right number have arrived. Answered by [`Action::Accept`],
+    /// [`Action::Compared`] or [`Action::Refuse`] before any other action.
     JobDone {
         /// Who sent them.
         worker: WorkerId,
@@ -83,6 +92,9 @@ pub enum Event {
         lease: LeaseId,
         /// How long the worker says it rendered, microseconds.
         cost_us: u64,
+        /// A number that equal pixels share and others do not; compared in audits, anything
+        /// where [`crate::Config::audit`] is none.
+        digest: u64,
     },
     /// When a worker could not render a job, or sent pixels that cannot be right.
     JobFailed {
@@ -125,12 +137,17 @@ pub enum Event {
         /// of what the workers can do.
         priority: i32,
     },
-    /// When an operator gives a worker that was blocked another chance.
+    /// When an operator gives a worker that was blocked or is distrusted another chance.
     WorkerCleared {
         /// The worker.
         worker: WorkerId,
-        /// The shot that it was blocked for.
-        shot: ShotId,
+        /// The shot that it was blocked for; `None` for all.
+        shot: Option<ShotId>,
+    },
+    /// When a worker is known to be one that is distrusted: it was, and came back.
+    WorkerDistrusted {
+        /// The worker.
+        worker: WorkerId,
     },
     /// When any bytes have come from a worker. The other events from workers imply it.
     HeardFrom {
@@ -155,6 +172,45 @@ pub enum Action {
         /// The frame.
         frame: FrameIndex,
         /// The pixels.
+        region: Region,
+    },
+    /// Send a job whose pixels are there already: they will be compared. The worker is not
+    /// to know; the shot is not over before.
+    Audit {
+        /// To whom.
+        worker: WorkerId,
+        /// The number under which the result is awaited, larger than all before.
+        lease: LeaseId,
+        /// The lease under which the job was accepted.
+        of: LeaseId,
+        /// The shot.
+        shot: ShotId,
+        /// The frame; it may be complete and taken.
+        frame: FrameIndex,
+        /// The pixels.
+        region: Region,
+    },
+    /// The pixels of the [`Event::JobDone`] being handled were those of an audit: throw them
+    /// away.
+    Compared {
+        /// Who sent them.
+        worker: WorkerId,
+        /// The lease they came under.
+        lease: LeaseId,
+        /// The lease under which the job was accepted.
+        of: LeaseId,
+        /// Whether they are what was accepted.
+        agrees: bool,
+    },
+    /// Forget pixels that were merged into an open frame; they will come again.
+    Retract {
+        /// Who sent them.
+        worker: WorkerId,
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// Where they are.
         region: Region,
     },
     /// Tell a worker that a job is not wanted any more. It may be done already.
@@ -236,6 +292,32 @@ pub enum Action {
         /// The shot.
         shot: ShotId,
     },
+    /// A worker is at fault and gets nothing more until [`Event::WorkerCleared`]; for the
+    /// operator.
+    Distrusted {
+        /// The worker; it may have gone.
+        worker: WorkerId,
+        /// What it did.
+        why: Distrust,
+        /// Complete frames of shots under way that have pixels of it.
+        sent: Vec<SentFrames>,
+    },
+    /// A worker that was distrusted gets jobs again. For the log.
+    Trusted {
+        /// The worker.
+        worker: WorkerId,
+    },
+    /// Workers differ and nobody can tell who is right; for the operator.
+    Disputed {
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// The pixels.
+        region: Region,
+        /// Who said what differs.
+        workers: Vec<WorkerId>,
+    },
     /// A worker gets jobs of that shot again, since the others are gone or do no better.
     /// For the log.
     Unblocked {
@@ -244,6 +326,53 @@ pub enum Action {
         /// The shot.
         shot: ShotId,
     },
+}
+
+/// Complete frames of a shot.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SentFrames {
+    /// The shot.
+    pub shot: ShotId,
+    /// The first and the last one of each run of frames. There may be other frames in between
+    /// if the runs are very many.
+    pub frames: Vec<(FrameIndex, FrameIndex)>,
+}
+
+/// Why a worker is distrusted.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
+pub enum Distrust {
+    /// When others agree on something else.
+    #[error("its {} x {} pixels at ({}, {}) of frame {frame} of {shot} differ from those of {}, which agree",
+        region.width, region.height, region.x, region.y, named(by))]
+    Outvoted {
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// The pixels.
+        region: Region,
+        /// Who agrees.
+        by: Vec<WorkerId>,
+    },
+    /// When it rendered the same twice, and differently.
+    #[error("it rendered {} x {} pixels at ({}, {}) of frame {frame} of {shot} twice, and differently",
+        region.width, region.height, region.x, region.y)]
+    Contradicted {
+        /// The shot.
+        shot: ShotId,
+        /// The frame.
+        frame: FrameIndex,
+        /// The pixels.
+        region: Region,
+    },
+    /// When it was distrusted on an earlier connection.
+    #[error("it was at fault before it connected again")]
+    Before,
+}
+
+fn named(workers: &[WorkerId]) -> String {
+    let names: Vec<String> = workers.iter().map(WorkerId::to_string).collect();
+    names.join(" and ")
 }
 
 /// How a connection ended.

@@ -1,5 +1,6 @@
 //! Giving jobs out: which, how large, to whom, and when twice.
 
+use crate::audit::AuditId;
 use crate::config::Config;
 use crate::event::Action;
 use crate::lease::Lease;
@@ -7,7 +8,7 @@ use crate::outcome::HOPELESS_EXPIRIES;
 use crate::scheduler::{Scheduler, Timer};
 use crate::shot::{Job, JobKey, Shot};
 use crate::worker::Worker;
-use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
+use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 
 /// A job takes at most this share of the time that all that is left would take the whole
 /// farm: one half lets every worker come twice more, so that errors of prediction level
@@ -31,6 +32,7 @@ const MAX_DOUBLINGS: u32 = 6;
 impl Scheduler {
     /// Grants while there are hungry workers and something to grant, then hedges.
     pub(crate) fn dispatch(&mut self) {
+        self.dispatch_audits();
         while let Some(&(_, _, worker)) = self.hungry.first() {
             if self.ready.is_empty() {
                 break;
@@ -57,7 +59,7 @@ impl Scheduler {
             let shot = self.shots.get(&id).filter(|shot| !shot.blocked.contains(&worker))?;
             let again = shot.waiting.iter().take(WAITING_LOOK).find(|(_, job)| {
                 let others = job.failed_on.iter().filter(|&failed| {
-                    self.workers.get(failed).is_some_and(|failed| !failed.is_draining)
+                    self.workers.get(failed).is_some_and(|failed| failed.is_active())
                         && !shot.blocked.contains(failed)
                 });
                 !job.failed_on.contains(&worker)
@@ -98,45 +100,60 @@ impl Scheduler {
     }
 
     /// Grants a job that is in no list of its shot, or is running there already.
-    fn grant(&mut self, worker: WorkerId, shot: ShotId, key: JobKey, mut job: Job) {
-        let (Some(known), Some(of)) = (self.workers.get(&worker), self.shots.get_mut(&shot)) else {
-            return;
-        };
-        let cost = of.costs.run(key.1, job.end);
-        let queued = known.held.iter().filter_map(|lease| self.leases.held.get(lease));
-        let ahead_us: u64 = queued.map(|lease| known.duration_us(lease.cost)).sum();
-        let own_us = known.duration_us(cost).saturating_add(known.overhead_us as u64);
-        let lease = self.leases.grant(Lease {
-            worker,
-            shot,
-            frame: key.0,
-            start: key.1,
-            cost,
-            is_founded: of.costs.is_measured(),
-            granted_at: self.now,
-            was_idle: known.held.is_empty(),
-            expected_at: self.now.after(ahead_us).after(own_us),
-            late_at: None,
-        });
+    fn grant(&mut self, worker: WorkerId, shot: ShotId, key: JobKey, job: Job) {
+        let Some(of) = self.shots.get_mut(&shot) else { return };
+        let (cost, is_founded) = (of.costs.run(key.1, job.end), of.costs.is_measured());
         let region = of.grid.region(key.1, job.end);
+        of.running.insert(key, job);
+        let place = (shot, key.0, key.1);
+        let Some(lease) = self.lease(worker, place, cost, is_founded, None) else { return };
+        let of = self.shots.get_mut(&shot);
+        let Some(job) = of.and_then(|of| of.running.get_mut(&key)) else { return };
         job.leases.push(lease);
         let leases = job.leases.clone();
-        of.running.insert(key, job);
-        self.account.granted += 1;
         self.account.hedged += u64::from(leases.len() > 1);
-        if let Some(known) = self.workers.get_mut(&worker) {
-            known.held.push_back(lease);
-            if known.held.len() == 1 {
-                self.start_head(worker);
-            }
-        }
-        self.charge(shot, cost);
         for lease in leases {
             self.refresh_hedgeable(lease);
         }
         self.refresh_hunger(worker);
         let frame = key.0;
         self.actions.push_back(Action::Grant { worker, lease, shot, frame, region });
+    }
+
+    /// Puts a lease behind those that a worker holds.
+    pub(crate) fn lease(
+        &mut self,
+        worker: WorkerId,
+        (shot, frame, start): (ShotId, FrameIndex, u32),
+        cost: f64,
+        is_founded: bool,
+        audit: Option<AuditId>,
+    ) -> Option<LeaseId> {
+        let known = self.workers.get(&worker)?;
+        let queued = known.held.iter().filter_map(|lease| self.leases.held.get(lease));
+        let ahead_us: u64 = queued.map(|lease| known.duration_us(lease.cost)).sum();
+        let own_us = known.duration_us(cost).saturating_add(known.overhead_us as u64);
+        let lease = self.leases.grant(Lease {
+            worker,
+            shot,
+            frame,
+            start,
+            audit,
+            cost,
+            is_founded,
+            granted_at: self.now,
+            was_idle: known.held.is_empty(),
+            expected_at: self.now.after(ahead_us).after(own_us),
+            late_at: None,
+        });
+        self.account.granted += 1;
+        self.charge(shot, cost);
+        let known = self.workers.get_mut(&worker)?;
+        known.held.push_back(lease);
+        if known.held.len() == 1 {
+            self.start_head(worker);
+        }
+        Some(lease)
     }
 
     /// The first job of a worker begins now: its time runs.
@@ -148,10 +165,7 @@ impl Scheduler {
         let Some(&head) = known.held.front() else { return };
         let Some(lease) = self.leases.held.get_mut(&head) else { return };
         let own_us = known.duration_us(lease.cost).saturating_add(known.overhead_us as u64);
-        let job = self
-            .shots
-            .get(&lease.shot)
-            .and_then(|shot| shot.running.get(&(lease.frame, lease.start)));
+        let job = self.shots.get(&lease.shot).and_then(|shot| shot.job_of(lease));
         let doublings = job.map_or(0, |job| job.expiries).min(MAX_DOUBLINGS);
         // A suspect's speed is a guess from doing nothing: it gets no longer than the others.
         let average = self.active_speed / self.active.max(1) as f64;
@@ -174,10 +188,7 @@ impl Scheduler {
             self.hedgeable.remove(&(before, id));
         }
         let Some(worker) = self.workers.get(&lease.worker) else { return };
-        let job = self
-            .shots
-            .get(&lease.shot)
-            .and_then(|shot| shot.running.get(&(lease.frame, lease.start)));
+        let job = self.shots.get(&lease.shot).and_then(|shot| shot.job_of(lease));
         if job.is_some_and(|job| job.leases.len() == 1) {
             let slack_us = (LATE_SHARE * worker.duration_us(lease.cost) as f64) as u64;
             let late_at = lease.expected_at.after(slack_us).after(LATE_US);

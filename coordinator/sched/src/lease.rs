@@ -1,5 +1,6 @@
 //! Leases: a job granted to one worker until a time.
 
+use crate::audit::AuditId;
 use crate::event::{Micros, RefuseReason};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
@@ -18,6 +19,8 @@ pub(crate) struct Lease {
     pub(crate) frame: FrameIndex,
     /// First atom of the job.
     pub(crate) start: u32,
+    /// What it is an audit for, if it is one; then it is for no job of the shot.
+    pub(crate) audit: Option<AuditId>,
     /// Expected cost when it was granted, cost units.
     pub(crate) cost: f64,
     /// Whether the cost was founded on results of the shot.

@@ -33,6 +33,7 @@
 //! small ones at the end (guided self-scheduling), each as long as its worker is fast.
 //! Frame n + 1 starts before n is done, as in section 3 of the flythrough paper.
 
+mod audit;
 mod check;
 mod config;
 mod event;
@@ -54,7 +55,8 @@ pub use config::{
     Config, MAX_FRAMES, MAX_FRAMES_IN_FLIGHT, MAX_JOBS_PER_FRAME, MAX_SHOTS, MAX_WORKERS,
 };
 pub use event::{
-    Action, DropReason, Event, FrameFailure, LostReason, Micros, RefuseReason, ShotFailure,
+    Action, Distrust, DropReason, Event, FrameFailure, LostReason, Micros, RefuseReason,
+    SentFrames, ShotFailure,
 };
 pub use order::YIELD_US;
 pub use scheduler::{Account, Scheduler};

@@ -31,6 +31,7 @@ impl Scheduler {
             self.end_lease(lease, End::Barred);
         }
         self.refresh_ready(shot);
+        self.close_audits_of(shot);
     }
 
     /// Lets a shot go on.
@@ -56,19 +57,23 @@ impl Scheduler {
         self.refresh_ready(shot);
     }
 
-    /// Gives one worker another chance at a shot.
-    pub(crate) fn clear(&mut self, worker: WorkerId, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
-        known.faults.remove(&worker);
-        if known.blocked.remove(&worker) {
-            self.actions.push_back(Action::Unblocked { worker, shot });
-            self.unpark();
+    /// Gives one worker another chance, at one shot or at all.
+    pub(crate) fn clear(&mut self, worker: WorkerId, shot: Option<ShotId>) {
+        self.trust(worker);
+        for (&id, known) in &mut self.shots {
+            if shot.is_none_or(|shot| shot == id) {
+                known.faults.remove(&worker);
+                if known.blocked.remove(&worker) {
+                    self.actions.push_back(Action::Unblocked { worker, shot: id });
+                }
+            }
         }
+        self.unpark();
     }
 
     /// Takes from the workers what is less urgent than what waits, and gives them that.
     pub(crate) fn make_way(&mut self) {
-        let busy = self.workers.iter().filter(|(_, known)| !known.is_draining);
+        let busy = self.workers.iter().filter(|(_, known)| known.is_active());
         let mut workers: Vec<_> = busy.map(|(&id, known)| (self.loss_us(known), id)).collect();
         workers.sort_unstable();
         for (_, worker) in workers {

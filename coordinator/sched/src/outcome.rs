@@ -3,6 +3,7 @@
 use crate::event::{Action, FrameFailure, ShotFailure};
 use crate::lease::Lease;
 use crate::scheduler::{Scheduler, Timer};
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 
 /// A job that fails so often fails its frame.
@@ -38,7 +39,7 @@ pub(crate) enum End {
 
 impl Scheduler {
     /// A result has come in.
-    pub(crate) fn job_done(&mut self, worker: WorkerId, id: LeaseId, cost_us: u64) {
+    pub(crate) fn job_done(&mut self, worker: WorkerId, id: LeaseId, cost_us: u64, digest: u64) {
         if !self.leases.is_held_by(id, worker) {
             let why = self.leases.why_refused(id);
             self.account.refused += 1;
@@ -46,13 +47,18 @@ impl Scheduler {
             return;
         }
         let Some((lease, _)) = self.release(id) else { return };
-        self.account.accepted += 1;
         self.leases.remember_accepted(id);
+        if lease.audit.is_some() {
+            self.account.audited += 1;
+            self.compare(id, &lease, digest, cost_us);
+            return;
+        }
+        self.account.accepted += 1;
         let Some(shot) = self.shots.get_mut(&lease.shot) else { return };
         let Some(job) = shot.running.remove(&(lease.frame, lease.start)) else { return };
         let region = shot.grid.region(lease.start, job.end);
         if let Some(frame) = shot.open.get_mut(&lease.frame) {
-            frame.accept(lease.start, job.end);
+            frame.accept(lease.start, job.end, worker);
         }
         let (shot, frame) = (lease.shot, lease.frame);
         self.actions.push_back(Action::Accept { lease: id, shot, frame, region });
@@ -62,12 +68,13 @@ impl Scheduler {
                 self.end_lease(other, End::Unwanted);
             }
         }
+        self.draw_audit(id, &lease, job.end, digest);
         self.finish_frame(lease.shot, lease.frame);
         self.refresh_hunger(worker);
     }
 
     /// Brings the estimates up to date.
-    fn learn(&mut self, lease: &Lease, end: u32, cost_us: u64) {
+    pub(crate) fn learn(&mut self, lease: &Lease, end: u32, cost_us: u64) {
         let Some(worker) = self.workers.get_mut(&lease.worker) else { return };
         // Nobody has rendered for longer than since the grant, whatever the report says.
         let turn_us = self.now.since(lease.granted_at).clamp(1, MAX_COST_US);
@@ -85,7 +92,7 @@ impl Scheduler {
         let cost = time_us * speed / unit;
         if lease.is_founded {
             worker.speed.learn(lease.cost, time_us);
-            if !worker.is_draining {
+            if worker.is_active() {
                 self.active_speed += worker.speed.value() - speed;
             }
         }
@@ -101,14 +108,19 @@ impl Scheduler {
         if shot.open.get(&frame).is_none_or(|open| open.left > 0) {
             return;
         }
-        shot.open.remove(&frame);
+        if let Some(open) = shot.open.remove(&frame)
+            && self.config.audit != Share::NONE
+        {
+            shot.remember_sent(frame, &open);
+        }
         shot.untaken.insert(frame);
         shot.completed += 1;
         self.actions.push_back(Action::FrameComplete { shot: id, frame });
         self.finish_shot(id);
     }
 
-    fn finish_shot(&mut self, id: ShotId) {
+    /// Says that a shot is over, if it is.
+    pub(crate) fn finish_shot(&mut self, id: ShotId) {
         let Some(shot) = self.shots.get(&id).filter(|shot| shot.is_done()) else { return };
         let failed_frames = shot.failed;
         self.forget_shot(id);
@@ -121,6 +133,10 @@ impl Scheduler {
             return;
         }
         let Some(lease) = self.leases.held.get(&id) else { return };
+        if lease.audit.is_some() {
+            self.end_lease(id, End::Failed);
+            return;
+        }
         let (of, key) = (lease.shot, (lease.frame, lease.start));
         let Some(shot) = self.shots.get_mut(&of) else { return };
         let Some(job) = shot.running.get_mut(&key) else { return };
@@ -161,7 +177,7 @@ impl Scheduler {
 
     /// Gives a worker no more of a shot, unless nobody else could do it.
     fn block(&mut self, worker: WorkerId, id: ShotId) {
-        let Some(known) = self.workers.get(&worker).filter(|known| !known.is_draining) else {
+        let Some(known) = self.workers.get(&worker).filter(|known| known.is_active()) else {
             return;
         };
         let held: Vec<LeaseId> = known.held.iter().copied().collect();
@@ -201,7 +217,7 @@ impl Scheduler {
             known.speed.learn_overdue(head.cost, now.since(known.head_since) as f64);
         }
         known.is_suspect = true;
-        if !known.is_draining {
+        if known.is_active() {
             self.active_speed += known.speed.value() - before;
         }
         let held: Vec<LeaseId> = known.held.iter().copied().collect();
@@ -228,6 +244,10 @@ impl Scheduler {
             self.actions.push_back(Action::Revoke { worker: lease.worker, lease: id });
         }
         self.refresh_hunger(lease.worker);
+        if let Some(audit) = lease.audit {
+            self.unanswered(audit, matches!(end, End::Failed | End::Expired));
+            return;
+        }
         let key = (lease.frame, lease.start);
         let Some(shot) = self.shots.get_mut(&lease.shot) else { return };
         let Some(job) = shot.running.get_mut(&key) else { return };

@@ -3,8 +3,9 @@
 //! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `order.rs` obeys people,
 //! `share.rs` keeps equals equal, and `check.rs` states what always holds.
 
+use crate::audit::Audits;
 use crate::config::{Config, MAX_SHOTS, MAX_WORKERS};
-use crate::event::{Action, DropReason, Event, Micros, ShotFailure};
+use crate::event::{Action, Distrust, DropReason, Event, Micros, ShotFailure};
 use crate::lease::Leases;
 use crate::outcome::End;
 use crate::rng::Rng;
@@ -17,10 +18,12 @@ use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 /// What became of every lease so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Account {
-    /// Leases granted; the six below add up to it, together with those still held.
+    /// Leases granted; the seven below add up to it, together with those still held.
     pub granted: u64,
     /// Ended by a result that was merged.
     pub accepted: u64,
+    /// Ended by a result that was compared with one merged before.
+    pub audited: u64,
     /// Ended by a failure that the worker reported.
     pub failed: u64,
     /// Ended by their time.
@@ -54,13 +57,14 @@ pub(crate) enum Timer {
 #[derive(Debug)]
 pub struct Scheduler {
     pub(crate) config: Config,
-    rng: Rng,
+    pub(crate) rng: Rng,
     pub(crate) now: Micros,
     pub(crate) actions: VecDeque<Action>,
     pub(crate) account: Account,
     pub(crate) workers: BTreeMap<WorkerId, Worker>,
     pub(crate) shots: BTreeMap<ShotId, Shot>,
     pub(crate) leases: Leases,
+    pub(crate) audits: Audits,
     pub(crate) timers: BTreeSet<(Micros, Timer)>,
     /// Workers that can take another job.
     pub(crate) hungry: BTreeSet<HungerKey>,
@@ -89,6 +93,7 @@ impl Scheduler {
             workers: BTreeMap::new(),
             shots: BTreeMap::new(),
             leases: Leases::default(),
+            audits: Audits::default(),
             timers: BTreeSet::new(),
             hungry: BTreeSet::new(),
             parked: BTreeSet::new(),
@@ -110,6 +115,10 @@ impl Scheduler {
         );
         match event {
             Event::WorkerJoined { worker, threads } => self.join(worker, threads),
+            Event::WorkerMeasured { worker, pixels_per_s } => {
+                self.hear(worker);
+                self.measure(worker, pixels_per_s);
+            }
             Event::WorkerLost { worker, why: _ } => self.forget_worker(worker),
             Event::WorkerDraining { worker } => {
                 self.hear(worker);
@@ -136,9 +145,9 @@ impl Scheduler {
                 let made = Shot::new(&self.config, frames, size, split, priority, frames_in_flight);
                 self.submit(shot, made);
             }
-            Event::JobDone { worker, lease, cost_us } => {
+            Event::JobDone { worker, lease, cost_us, digest } => {
                 self.hear(worker);
-                self.job_done(worker, lease, cost_us);
+                self.job_done(worker, lease, cost_us, digest);
             }
             Event::JobFailed { worker, lease, reason } => {
                 self.hear(worker);
@@ -155,6 +164,11 @@ impl Scheduler {
             Event::ShotResumed { shot } => self.resume(shot),
             Event::ShotPrioritised { shot, priority } => self.prioritise(shot, priority),
             Event::WorkerCleared { worker, shot } => self.clear(worker, shot),
+            Event::WorkerDistrusted { worker } => {
+                if self.workers.contains_key(&worker) {
+                    self.distrust(worker, Distrust::Before);
+                }
+            }
             Event::HeardFrom { worker } => self.hear(worker),
             Event::Tick => {}
         }
@@ -208,14 +222,37 @@ impl Scheduler {
             return;
         }
         let joined = Worker::new(threads, self.now);
-        self.active += 1;
-        self.active_threads += u64::from(joined.threads);
-        self.active_speed += joined.speed.value();
         self.workers.insert(worker, joined);
+        self.enter_active(worker);
         let spread = self.rng.below(self.config.heartbeat_us / 4);
         let beat_at = self.now.after(self.config.heartbeat_us - spread);
         self.timers.insert((beat_at, Timer::Beat(worker)));
         self.refresh_hunger(worker);
+    }
+
+    /// Guesses the speed of a new worker: it is to that of the others as its measurement is
+    /// to theirs. The median, so that one odd measurement does not spoil all guesses.
+    fn measure(&mut self, worker: WorkerId, pixels_per_s: u64) {
+        let measured = pixels_per_s.max(1) as f64;
+        let others = self.workers.iter().filter(|&(&id, known)| id != worker && known.is_active());
+        let mut ratios: Vec<f64> =
+            others.filter_map(|(_, known)| Some(known.speed.value() / known.measured?)).collect();
+        ratios.sort_unstable_by(f64::total_cmp);
+        let average = self.active_speed / self.active_threads.max(1) as f64;
+        let Some(known) = self.workers.get_mut(&worker).filter(|known| known.measured.is_none())
+        else {
+            return;
+        };
+        known.measured = Some(measured);
+        if let Some(ratio) = ratios.get(ratios.len() / 2) {
+            let before = known.speed.value();
+            known.guess(ratio * measured, average);
+            let change = known.speed.value() - before;
+            if known.is_active() {
+                self.active_speed += change;
+            }
+            self.refresh_hunger(worker);
+        }
     }
 
     fn hear(&mut self, worker: WorkerId) {
@@ -225,15 +262,25 @@ impl Scheduler {
     }
 
     fn drain(&mut self, worker: WorkerId) {
-        if let Some(known) = self.workers.get_mut(&worker).filter(|known| !known.is_draining) {
-            known.is_draining = true;
+        let Some(known) = self.workers.get_mut(&worker) else { return };
+        let was_active = known.is_active();
+        known.is_draining = true;
+        if was_active {
             self.leave_active(worker);
             self.refresh_hunger(worker);
         }
     }
 
+    /// Takes a worker into the sums.
+    pub(crate) fn enter_active(&mut self, worker: WorkerId) {
+        let Some(known) = self.workers.get(&worker) else { return };
+        self.active += 1;
+        self.active_threads += u64::from(known.threads);
+        self.active_speed += known.speed.value();
+    }
+
     /// Takes a worker out of the sums, and of what the shots know of it.
-    fn leave_active(&mut self, worker: WorkerId) {
+    pub(crate) fn leave_active(&mut self, worker: WorkerId) {
         let Some(known) = self.workers.get(&worker) else { return };
         self.active -= 1;
         self.active_threads -= u64::from(known.threads);
@@ -255,7 +302,7 @@ impl Scheduler {
     fn forget_worker(&mut self, worker: WorkerId) {
         let Some(known) = self.workers.get(&worker) else { return };
         let held: Vec<LeaseId> = known.held.iter().copied().collect();
-        if !known.is_draining {
+        if known.is_active() {
             self.leave_active(worker);
         }
         for lease in held {
@@ -292,16 +339,15 @@ impl Scheduler {
 
     /// Removes a shot and revokes its leases.
     pub(crate) fn forget_shot(&mut self, shot: ShotId) {
-        let Some(known) = self.shots.get_mut(&shot) else { return };
+        let Some(known) = self.shots.get(&shot) else { return };
         let jobs = known.running.values();
         let leases: Vec<LeaseId> = jobs.flat_map(|job| job.leases.iter().copied()).collect();
-        if let Some(key) = known.ready.take() {
-            self.ready.remove(&key);
-        }
+        self.unready(shot);
         for lease in leases {
             self.end_lease(lease, End::Unwanted);
         }
         self.shots.remove(&shot);
+        self.close_audits_of(shot);
     }
 
     fn fire_timers(&mut self) {
@@ -364,8 +410,8 @@ impl Scheduler {
 
     fn wants_more(&self, worker: &Worker) -> bool {
         let held = worker.held.len();
-        if worker.is_draining || held == 0 || worker.is_suspect {
-            return !worker.is_draining && held == 0;
+        if !worker.is_active() || held == 0 || worker.is_suspect {
+            return worker.is_active() && held == 0;
         }
         if held <= self.config.queue_depth {
             return true;

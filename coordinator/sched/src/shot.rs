@@ -3,14 +3,18 @@
 //! Frames before `next_frame` are done unless they are in `open`; those from it on have
 //! not cost a byte yet.
 
-use crate::config::{Config, MAX_FRAMES, MAX_FRAMES_IN_FLIGHT, MAX_JOBS_PER_FRAME};
+use crate::config::{Config, MAX_FRAMES, MAX_FRAMES_IN_FLIGHT, MAX_JOBS_PER_FRAME, MAX_WORKERS};
 use crate::event::ShotFailure;
+use crate::lease::Lease;
 use crate::split::{CostMap, Grid};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use terrafarm_common::camera::MAX_SIDE_PX;
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::Split;
+
+/// How many runs of frames are remembered of a worker; of more, the oldest are joined.
+const MAX_RUNS: usize = 64;
 
 /// A job's place: frame and first atom. No two jobs share one, since they do not overlap.
 pub(crate) type JobKey = (FrameIndex, u32);
@@ -38,11 +42,13 @@ pub(crate) struct OpenFrame {
     accepted: Vec<u64>,
     /// Atoms not yet accepted.
     pub(crate) left: u32,
+    /// Who rendered what is accepted: first atom, one past the last one, worker.
+    by: Vec<(u32, u32, WorkerId)>,
 }
 
 impl OpenFrame {
     fn new(atoms: u32) -> Self {
-        OpenFrame { accepted: vec![0; atoms.div_ceil(64) as usize], left: atoms }
+        OpenFrame { accepted: vec![0; atoms.div_ceil(64) as usize], left: atoms, by: Vec::new() }
     }
 
     /// Whether an atom is accepted.
@@ -51,12 +57,26 @@ impl OpenFrame {
     }
 
     /// Marks atoms as accepted. They must not have been.
-    pub(crate) fn accept(&mut self, start: u32, end: u32) {
+    pub(crate) fn accept(&mut self, start: u32, end: u32, by: WorkerId) {
         for atom in start..end {
             debug_assert!(!self.has(atom), "atom {atom} accepted twice");
             self.accepted[atom as usize / 64] |= 1 << (atom % 64);
         }
         self.left -= end - start;
+        self.by.push((start, end, by));
+    }
+
+    /// Marks all that a worker rendered as not accepted; the jobs that it was in.
+    pub(crate) fn take_back(&mut self, worker: WorkerId) -> Vec<(u32, u32)> {
+        let own = self.by.extract_if(.., |(_, _, by)| *by == worker);
+        let own: Vec<(u32, u32)> = own.map(|(start, end, _)| (start, end)).collect();
+        for &(start, end) in &own {
+            for atom in start..end {
+                self.accepted[atom as usize / 64] &= !(1 << (atom % 64));
+            }
+            self.left += end - start;
+        }
+        own
     }
 }
 
@@ -108,6 +128,10 @@ pub(crate) struct Shot {
     pub(crate) failed: u32,
     /// Workers that get no more of it.
     pub(crate) blocked: BTreeSet<WorkerId>,
+    /// Audits of its jobs that are not decided.
+    pub(crate) audits: u32,
+    /// Runs of complete frames that have pixels of a worker; kept where jobs are audited.
+    sent: BTreeMap<WorkerId, Vec<(FrameIndex, FrameIndex)>>,
     /// How many jobs each worker failed at.
     pub(crate) faults: BTreeMap<WorkerId, u32>,
     /// Where it stands among the shots with something to grant, if it does.
@@ -158,9 +182,17 @@ impl Shot {
             completed: 0,
             failed: 0,
             blocked: BTreeSet::new(),
+            audits: 0,
+            sent: BTreeMap::new(),
             faults: BTreeMap::new(),
             ready: None,
         })
+    }
+
+    /// The job that a lease is for; `None` for that of an audit.
+    pub(crate) fn job_of(&self, lease: &Lease) -> Option<&Job> {
+        let job = self.running.get(&(lease.frame, lease.start));
+        job.filter(|_| lease.audit.is_none())
     }
 
     /// Frames that may be begun now.
@@ -180,9 +212,46 @@ impl Shot {
         self.cutting.is_some() || self.frames_to_open() > 0
     }
 
-    /// Whether every frame is complete or has failed.
+    /// Whether every frame is complete or has failed, and every audit is decided.
     pub(crate) fn is_done(&self) -> bool {
-        self.completed + self.failed == self.frames
+        self.completed + self.failed == self.frames && self.audits == 0
+    }
+
+    /// Remembers who rendered parts of a frame that is complete.
+    pub(crate) fn remember_sent(&mut self, frame: FrameIndex, open: &OpenFrame) {
+        for &(_, _, worker) in &open.by {
+            if self.sent.len() >= MAX_WORKERS && !self.sent.contains_key(&worker) {
+                continue;
+            }
+            let runs = self.sent.entry(worker).or_default();
+            // Frames are complete in nearly their order: look from the end.
+            let near = |run: &&mut (u32, u32)| {
+                run.0 <= frame.saturating_add(1) && frame <= run.1.saturating_add(1)
+            };
+            match runs.iter_mut().rev().find(near) {
+                Some(run) => *run = (run.0.min(frame), run.1.max(frame)),
+                None => runs.push((frame, frame)),
+            }
+            if runs.len() > MAX_RUNS {
+                runs.sort_unstable();
+                let (first, second) = (runs.remove(0), &mut runs[0]);
+                *second = (first.0, second.1.max(first.1));
+            }
+        }
+    }
+
+    /// Runs of complete frames that have pixels of a worker, in their order.
+    pub(crate) fn sent_of(&self, worker: WorkerId) -> Vec<(FrameIndex, FrameIndex)> {
+        let mut runs = self.sent.get(&worker).cloned().unwrap_or_default();
+        runs.sort_unstable();
+        let mut joined: Vec<(FrameIndex, FrameIndex)> = Vec::new();
+        for run in runs {
+            match joined.last_mut() {
+                Some(last) if run.0 <= last.1.saturating_add(1) => last.1 = last.1.max(run.1),
+                _ => joined.push(run),
+            }
+        }
+        joined
     }
 
     /// Expected cost of all that may be granted now, without the jobs that wait again.

@@ -132,6 +132,11 @@ impl Scheduler {
         self.workers.get(&worker).is_some_and(|known| known.is_draining)
     }
 
+    /// Whether a worker was at fault in an audit and gets nothing until it is cleared.
+    pub fn is_distrusted(&self, worker: WorkerId) -> bool {
+        self.workers.get(&worker).is_some_and(|known| known.is_distrusted)
+    }
+
     /// When the last byte of a worker came.
     pub fn heard_at(&self, worker: WorkerId) -> Option<Micros> {
         self.workers.get(&worker).map(|known| known.heard_at)

@@ -9,6 +9,9 @@ use terrafarm_common::id::{LeaseId, WorkerId};
 const MAX_THREADS: u32 = 4096;
 /// Time that the first guess of a speed stands for, microseconds: one job outweighs it.
 const PRIOR_TIME_US: f64 = 20_000.0;
+/// A thread is taken to be at most so many times faster or slower than the others before
+/// its first job.
+const GUESS_RANGE: f64 = 32.0;
 /// How much of what is known about a speed is kept when a job comes in.
 const SPEED_MEMORY: f64 = 0.7;
 /// Speeds are whole multiples of this, so that sums of thousands are exact in f64 and do
@@ -27,12 +30,8 @@ pub(crate) struct Speed {
 }
 
 impl Speed {
-    fn guess(threads: u32) -> Self {
-        Speed {
-            work: f64::from(threads) * PRIOR_TIME_US,
-            time_us: PRIOR_TIME_US,
-            is_measured: false,
-        }
+    fn guess(speed: f64) -> Self {
+        Speed { work: speed * PRIOR_TIME_US, time_us: PRIOR_TIME_US, is_measured: false }
     }
 
     /// The estimate.
@@ -66,6 +65,8 @@ pub(crate) struct Worker {
     pub(crate) threads: u32,
     /// How fast it renders.
     pub(crate) speed: Speed,
+    /// How fast it rendered what is the same for all, pixels a second, if it has said so.
+    pub(crate) measured: Option<f64>,
     /// What a job takes at an idle worker beyond rendering, microseconds: the way there
     /// and back. Decaying mean.
     pub(crate) overhead_us: f64,
@@ -79,6 +80,8 @@ pub(crate) struct Worker {
     pub(crate) yields_at: Option<Micros>,
     /// Wants to leave.
     pub(crate) is_draining: bool,
+    /// Was at fault in an audit: gets nothing.
+    pub(crate) is_distrusted: bool,
     /// Let a lease expire and has done nothing since: gets one job at a time.
     pub(crate) is_suspect: bool,
     /// When the last byte came.
@@ -93,17 +96,34 @@ impl Worker {
         let threads = threads.clamp(1, MAX_THREADS);
         Worker {
             threads,
-            speed: Speed::guess(threads),
+            speed: Speed::guess(f64::from(threads)),
+            measured: None,
             overhead_us: 0.0,
             held: VecDeque::new(),
             head_since: now,
             head_deadline: None,
             yields_at: None,
             is_draining: false,
+            is_distrusted: false,
             is_suspect: false,
             heard_at: now,
             hunger: None,
         }
+    }
+
+    /// Takes a better guess of its speed than its threads, unless a job has been measured.
+    /// `average` is what a thread of the farm does. A measurement is believed within
+    /// [`GUESS_RANGE`] of that.
+    pub(crate) fn guess(&mut self, speed: f64, average: f64) {
+        let usual = f64::from(self.threads) * if average > 0.0 { average } else { 1.0 };
+        if !self.speed.is_measured {
+            self.speed = Speed::guess(speed.clamp(usual / GUESS_RANGE, usual * GUESS_RANGE));
+        }
+    }
+
+    /// Whether it may get jobs.
+    pub(crate) fn is_active(&self) -> bool {
+        !self.is_draining && !self.is_distrusted
     }
 
     /// Expected time for a cost, microseconds.
@@ -129,7 +149,7 @@ mod tests {
 
     #[test]
     fn one_job_outweighs_the_guess() {
-        let mut speed = Speed::guess(8);
+        let mut speed = Speed::guess(8.0);
         assert_eq!(speed.value(), 8.0);
         speed.learn(200_000.0, 100_000.0);
         assert!((speed.value() - 2.74).abs() < 0.1, "{}", speed.value());
@@ -141,7 +161,7 @@ mod tests {
 
     #[test]
     fn an_overdue_job_never_makes_a_worker_faster() {
-        let mut speed = Speed::guess(1);
+        let mut speed = Speed::guess(1.0);
         speed.learn_overdue(1e9, 10.0);
         assert_eq!(speed.value(), 1.0);
         speed.learn_overdue(1000.0, 1e6);
@@ -150,7 +170,7 @@ mod tests {
 
     #[test]
     fn absurd_measurements_stay_in_range() {
-        let mut speed = Speed::guess(u32::MAX);
+        let mut speed = Speed::guess(f64::from(u32::MAX));
         speed.learn(1e18, 0.0);
         assert!(speed.value() <= MAX_SPEED);
         for _ in 0..200 {

@@ -4,6 +4,7 @@
 
 use proptest::prelude::*;
 use std::collections::VecDeque;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::{Region, Split};
 use terrafarm_sched::journal::{JOURNAL_BYTES, Recorder, replay};
@@ -83,7 +84,7 @@ impl Farm {
     }
 
     fn done(&mut self, job: Granted, cost_us: u64) -> Vec<Action> {
-        self.tell(Event::JobDone { worker: job.worker, lease: job.lease, cost_us })
+        self.tell(Event::JobDone { worker: job.worker, lease: job.lease, cost_us, digest: 0 })
     }
 
     fn fail(&mut self, job: Granted) -> Vec<Action> {
@@ -522,14 +523,20 @@ fn any_event() -> impl Strategy<Value = Event> {
             |(shot, frames, width, height, split, priority, frames_in_flight)| Event::ShotSubmitted {
                 shot, frames, width, height, split, priority, frames_in_flight,
             }),
-        12 => (worker(), lease(), cost).prop_map(|(worker, lease, cost_us)| Event::JobDone { worker, lease, cost_us }),
+        12 => (worker(), lease(), cost, 0u64..2).prop_map(|(worker, lease, cost_us, digest)| {
+            Event::JobDone { worker, lease, cost_us, digest }
+        }),
         4 => (worker(), lease()).prop_map(|(worker, lease)| Event::JobFailed { worker, lease, reason: "bad".into() }),
         3 => (shot(), 0u32..6).prop_map(|(shot, frame)| Event::FrameTaken { shot, frame }),
         1 => shot().prop_map(|shot| Event::ShotCanceled { shot }),
         1 => shot().prop_map(|shot| Event::ShotPaused { shot }),
         1 => shot().prop_map(|shot| Event::ShotResumed { shot }),
         1 => (shot(), -1i32..2).prop_map(|(shot, priority)| Event::ShotPrioritised { shot, priority }),
-        1 => (worker(), shot()).prop_map(|(worker, shot)| Event::WorkerCleared { worker, shot }),
+        1 => (worker(), prop::option::of(shot())).prop_map(|(worker, shot)| Event::WorkerCleared { worker, shot }),
+        1 => worker().prop_map(|worker| Event::WorkerDistrusted { worker }),
+        1 => (worker(), any::<u64>()).prop_map(|(worker, pixels_per_s)| {
+            Event::WorkerMeasured { worker, pixels_per_s }
+        }),
         2 => worker().prop_map(|worker| Event::HeardFrom { worker }),
         2 => Just(Event::Tick),
     ]
@@ -542,15 +549,20 @@ fn any_story() -> impl Strategy<Value = Vec<(u64, Event)>> {
 
 proptest! {
     #[test]
-    fn no_story_panics_or_breaks_an_invariant(story in any_story()) {
-        let mut farm = Farm::new();
+    fn no_story_panics_or_breaks_an_invariant(story in any_story(), audit in 0u32..1_000_000) {
+        let audit = Share::from_millionths(audit).unwrap();
+        let config = Config { audit, ..Config::default() };
+        let mut farm = Farm { scheduler: Scheduler::new(config, 1), ..Farm::new() };
         for (step, event) in story {
             // Time may also stand still, or jump to its end.
             farm.now = farm.now.saturating_add(step);
             let is_result = matches!(event, Event::JobDone { .. });
             let actions = farm.tell(event);
             let verdicts = actions.iter().filter(|action| {
-                matches!(action, Action::Accept { .. } | Action::Refuse { .. })
+                matches!(
+                    action,
+                    Action::Accept { .. } | Action::Refuse { .. } | Action::Compared { .. }
+                )
             });
             prop_assert_eq!(verdicts.count(), usize::from(is_result));
             // A late copy may be examined in portions, but not for ever.

@@ -3,7 +3,9 @@
 
 #![allow(clippy::unwrap_used)]
 
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::region::Split;
+use terrafarm_sched::Config;
 use terrafarm_sched::journal::{JOURNAL_BYTES, Stopped, replay};
 use terrafarm_sched::sim::{self, Faults, SimConfig, SimReport, simulate};
 
@@ -95,6 +97,23 @@ fn under_any_fault_schedule_every_frame_completes_exactly_once() {
     println!("expired {expired}, lost {lost}, hedged {hedged}");
     // Otherwise the schedules would not test what they are for.
     assert!(refused > 100 && expired > 100 && lost > 100 && hedged > 100 && zombies > 100);
+}
+
+#[test]
+fn audits_lose_and_repeat_nothing_under_any_fault_schedule() {
+    let mut audited = 0;
+    for seed in 0..seeds() / 3 {
+        let base = bad_night(seed, seed % 2 == 0);
+        let audit = Share::from_millionths(1 << (seed % 20)).expect("less than all");
+        let config = SimConfig { scheduler: Config { audit, ..Config::default() }, ..base };
+        let report = simulate(&config);
+        let over = report.frames + report.failed_frames;
+        let wanted = u64::from(config.frames) * u64::from(config.shots);
+        assert!(report.invariants.is_clean() && over == wanted, "{config:?} {report:?}");
+        audited += report.account.audited;
+    }
+    println!("audited {audited}");
+    assert!(audited > 100);
 }
 
 #[test]

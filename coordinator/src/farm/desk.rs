@@ -1,28 +1,33 @@
 //! What the farm shows of itself, and the orders it takes.
 
+use super::tally::ShotTally;
 use super::{Farm, Peer};
 use crate::order::{Order, OrderError};
 use crate::shots::Shot;
 use crate::view::{FarmView, JobView, ShotState, ShotView, WorkerState, WorkerView};
 use terrafarm_common::id::{FrameIndex, ShotId};
-use terrafarm_sched::{Event, Micros};
+use terrafarm_sched::{Event, Micros, Why};
 use terrafarm_wire::message::{Drain, ShotFailed};
 
+/// How many workers a sentence names; of more it gives the number.
+const NAMED: usize = 8;
+
 impl Farm {
-    /// Everything at this moment.
-    pub fn view(&self, now: Micros) -> FarmView {
+    /// Everything at this moment, which is `wall_s` seconds after 1970 began.
+    pub fn view(&mut self, now: Micros, wall_s: u64) -> FarmView {
+        self.tally.advance(now);
         let account = self.scheduler.account();
-        let shots: Vec<_> = self.shots.iter().map(|(id, state)| view_shot(id, state)).collect();
+        let shots = self.shots.iter().map(|(id, shot)| self.view_shot(now, wall_s, id, shot));
         FarmView {
             at_ms: now.0 / 1000,
-            workers: self.view_workers(),
+            workers: self.view_workers(now),
             jobs_running: self.scheduler.leases_held() as u64,
             jobs_done: account.accepted,
             jobs_repeated: account.failed + account.expired + account.lost,
             results_refused: account.refused,
-            frames_done: shots.iter().map(|shot| u64::from(shot.frames_done)).sum(),
-            shots,
-            history: Vec::new(),
+            frames_done: self.tally.frames_done,
+            shots: shots.collect(),
+            history: self.tally.history(),
         }
     }
 
@@ -60,7 +65,7 @@ impl Farm {
                 if !self.workers.contains_key(&worker) {
                     return Err(OrderError::NoWorker(worker));
                 }
-                self.schedule(now, Event::WorkerCleared { worker, shot });
+                self.schedule(now, Event::WorkerCleared { worker, shot: Some(shot) });
                 Ok(format!("{worker} gets jobs of {shot} again"))
             }
             Order::Drain(worker) => {
@@ -86,61 +91,90 @@ impl Farm {
         if frame >= frames {
             return Err(OrderError::NoFrame { shot, frames, frame });
         }
-        let held = self.granted.values().filter(|job| job.shot == shot && job.frame == frame);
-        let names: Vec<_> = held
-            .filter_map(|job| self.workers.get(&job.worker))
-            .map(|worker| worker.greeting.name.as_str())
-            .collect();
-        Ok(match names.len() {
-            0 => "no job of it runs".to_owned(),
-            jobs => format!("{jobs} jobs of it run, on {}", names.join(", ")),
+        Ok(match self.scheduler.why(shot, frame) {
+            // Names say more to people than numbers.
+            Why::Running { jobs, workers, waiting } => {
+                let names = workers.iter().filter_map(|worker| self.workers.get(worker));
+                let names: Vec<_> = names.map(|state| state.greeting.name.as_str()).collect();
+                let others = names.len().saturating_sub(NAMED);
+                let mut text = match jobs {
+                    1 => "1 job runs, on ".to_owned(),
+                    jobs => format!("{jobs} jobs run, on "),
+                };
+                text += &names[..names.len() - others].join(", ");
+                if others > 0 {
+                    text += &format!(" and {others} others");
+                }
+                if waiting > 0 {
+                    text += &format!("; {waiting} wait for a worker");
+                }
+                text
+            }
+            why => why.to_string(),
         })
     }
 
-    fn view_workers(&self) -> Vec<WorkerView> {
+    fn view_workers(&self, now: Micros) -> Vec<WorkerView> {
         let view = |(&id, state): (&_, &super::WorkerState)| {
             let first = state.leases.first().and_then(|lease| self.granted.get(lease));
+            let tally = self.tally.workers.get(&id);
+            let [rendering, terrain] = tally.map_or([0.0; 2], |tally| tally.shares(now));
             WorkerView {
                 id,
                 name: state.greeting.name.clone(),
                 threads: state.greeting.threads,
-                state: if state.leases.is_empty() { WorkerState::Idle } else { WorkerState::Busy },
-                speed: 1.0,
+                state: if self.scheduler.is_draining(id) {
+                    WorkerState::Draining
+                } else if state.leases.is_empty() {
+                    WorkerState::Idle
+                } else {
+                    WorkerState::Busy
+                },
+                speed: self.scheduler.speed_of(id).unwrap_or(1.0),
                 job: first.map(|job| JobView {
                     shot: job.shot,
                     frame: job.frame,
                     region: [job.region.x, job.region.y, job.region.width, job.region.height],
                 }),
                 jobs_held: state.leases.len() as u32,
-                jobs_done: 0,
-                jobs_failed: 0,
-                heard_ms: 0,
-                rendering: 0.0,
-                terrain: 0.0,
-                blocked: Vec::new(),
+                jobs_done: tally.map_or(0, |tally| tally.jobs_done),
+                jobs_failed: tally.map_or(0, |tally| tally.jobs_failed),
+                heard_ms: self.scheduler.heard_at(id).map_or(0, |heard| now.since(heard) / 1000),
+                rendering,
+                terrain,
+                blocked: tally
+                    .map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
                 distrusted: false,
             }
         };
         self.workers.iter().map(view).collect()
     }
-}
 
-fn view_shot(id: ShotId, state: &Shot) -> ShotView {
-    ShotView {
-        id,
-        name: state.submit.name.clone(),
-        state: ShotState::Running,
-        note: String::new(),
-        priority: state.submit.priority,
-        queued: false,
-        frames: state.submit.frames,
-        frames_done: state.frames_done,
-        frames_failed: state.frames_failed,
-        size: [state.submit.width, state.submit.height],
-        method: state.submit.quality.method.name().to_owned(),
-        submitted_s: 0,
-        frames_per_s: 0.0,
-        eta_s: None,
-        last_frame: None,
+    fn view_shot(&self, now: Micros, wall_s: u64, id: ShotId, shot: &Shot) -> ShotView {
+        let fresh = ShotTally::default();
+        let tally = self.tally.shots.get(&id).unwrap_or(&fresh);
+        let submit = &shot.submit;
+        let left = submit.frames.saturating_sub(shot.frames_done + shot.frames_failed);
+        let frames_per_s = tally.frames_per_s(now);
+        let is_paused = self.scheduler.is_paused(id);
+        let will_end = frames_per_s > 0.0 && !is_paused;
+        ShotView {
+            id,
+            name: submit.name.clone(),
+            state: if is_paused { ShotState::Paused } else { ShotState::Running },
+            note: String::new(),
+            priority: self.scheduler.priority(id).unwrap_or(submit.priority),
+            queued: shot.queued,
+            first_frame: 0,
+            frames: submit.frames,
+            frames_done: shot.frames_done,
+            frames_failed: shot.frames_failed,
+            size: [submit.width, submit.height],
+            method: submit.quality.method.name().to_owned(),
+            submitted_s: wall_s.saturating_sub(now.since(shot.since) / 1_000_000),
+            frames_per_s,
+            eta_s: will_end.then(|| f64::from(left) / frames_per_s),
+            last_frame: tally.last_frame,
+        }
     }
 }

@@ -23,8 +23,12 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let farm = Farm::new(terrafarm_sched::Config::default(), 1, 1 << 20);
-        Bench { farm, now: Micros(0) }
+        Bench::auditing(Share::NONE)
+    }
+
+    fn auditing(audit: Share) -> Self {
+        let config = terrafarm_sched::Config { audit, ..Default::default() };
+        Bench { farm: Farm::new(config, 1, 1 << 20), now: Micros(0) }
     }
 
     fn event(&mut self, peer: Peer, event: PeerEvent) -> Vec<Out> {
@@ -300,4 +304,70 @@ fn cameras_that_do_not_fit_reject_the_shot() {
     let out =
         bench.say(Peer::Client(CLIENT), Cameras { number: 7, first: 0, cameras: vec![camera] });
     assert!(matches!(&out[..], [Out::Send(_, Message::Rejected(_))]), "{out:?}");
+}
+
+/// What everyone but a liar renders: a number for each place.
+fn right(grant: &Grant) -> Vec<u8> {
+    let value = (grant.frame * 7 + grant.region.x) as u8 | 1;
+    vec![value; grant.region.area() as usize * 3]
+}
+
+/// Answers every grant, a liar's with other pixels; the frames that came out, each with
+/// whether all of it is right.
+fn render_with_liar(bench: &mut Bench, mut out: Vec<Out>, liar: WorkerId) -> Vec<(u32, bool)> {
+    let mut frames = Vec::new();
+    while !out.is_empty() {
+        let mut next = Vec::new();
+        for (worker, grant) in grants(&out) {
+            let mut pixels = right(&grant);
+            if worker == liar {
+                pixels.fill(0);
+            }
+            let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
+            next.extend(bench.say(Peer::Worker(worker), Done { pixels, ..done(&grant) }));
+        }
+        for one in out {
+            if let Out::SendFrame(_, head, picture) = one {
+                let frame = head.with(Pixels::raw(Bytes::new()).unwrap());
+                let (shot, frame) = (frame.shot, frame.frame);
+                let taken = terrafarm_wire::message::FrameTaken { shot, frame };
+                next.extend(bench.say(Peer::Client(CLIENT), taken));
+                frames.push((frame, picture.pixels().iter().all(|&byte| byte != 0)));
+            }
+        }
+        out = next;
+    }
+    frames
+}
+
+#[test]
+fn a_liar_is_found_out_by_audits_and_what_comes_later_is_right() {
+    let audit = "20%".parse().unwrap();
+    let mut bench = Bench::auditing(audit);
+    let liar = WorkerId(2);
+    (1..=4).for_each(|number| _ = bench.join(worker(number), 1));
+    let out = bench.submit(40);
+    let frames = render_with_liar(&mut bench, out, liar);
+    assert_eq!(frames.len(), 40);
+    let last_wrong = frames.iter().rposition(|(_, is_right)| !is_right);
+    assert!(last_wrong.is_none_or(|last| last < 30), "{frames:?}");
+    assert!(bench.farm.scheduler.is_distrusted(liar));
+    assert!(bench.farm.scheduler.account().audited > 0);
+    // It comes back under its name, and is known.
+    bench.gone(worker(2));
+    let back = Greeting { name: format!("{:?}", worker(2)), threads: 1 };
+    bench.event(worker(9), PeerEvent::Joined(back));
+    assert!(bench.farm.scheduler.is_distrusted(WorkerId(9)));
+}
+
+#[test]
+fn where_all_render_the_same_audits_change_nothing() {
+    let mut bench = Bench::auditing("100%".parse().unwrap());
+    (1..=3).for_each(|number| _ = bench.join(worker(number), 1));
+    let out = bench.submit(6);
+    let frames = render_with_liar(&mut bench, out, WorkerId(99));
+    assert!(frames.len() == 6 && frames.iter().all(|(_, is_right)| *is_right));
+    let account = bench.farm.scheduler.account();
+    assert!(account.audited > account.accepted / 2, "{account:?}");
+    assert!(bench.farm.shots.iter().next().is_none(), "the shot is over");
 }

@@ -1,12 +1,16 @@
 //! `manifest.json`: what a render was made of, and what came out. Scripts read it: keys
 //! are added freely, never renamed.
 
-use super::SinkError;
 use super::beside::Beside;
+use super::{SinkError, pixels_sha256};
+use crate::client::FrameFacts;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use terrafarm_common::accuracy::Summary;
 use terrafarm_common::id::FrameIndex;
+use terrafarm_common::image::Rgb8;
+use terrafarm_wire::message::WorkerShare;
 
 /// Everything about one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -100,6 +104,44 @@ pub struct FrameEntry {
     /// With `--check`: number of pixels that were measured.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub checked_pixels: Option<u64>,
+}
+
+impl FrameEntry {
+    /// The entry of a finished picture of this many samples a side of a pixel. The share of
+    /// fallbacks is at most 1, whatever workers counted.
+    pub fn new(index: FrameIndex, picture: &Rgb8, facts: &FrameFacts, samples: u32) -> Self {
+        let pixels = u64::from(picture.width()) * u64::from(picture.height());
+        let samples = pixels * u64::from(samples).pow(2);
+        let fallbacks = facts.fallbacks.min(samples);
+        let errors = facts.check.as_ref();
+        let error_px = errors.and_then(Summary::error_px);
+        FrameEntry {
+            index,
+            sha256: pixels_sha256(picture).to_hex(),
+            ms: facts.elapsed_us as f64 / 1e3,
+            render_ms: facts.cost_us as f64 / 1e3,
+            jobs: facts.jobs,
+            fallbacks,
+            fallback_share: fallbacks as f64 / samples.max(1) as f64,
+            below_ground: facts.below_ground,
+            error_px_p99: error_px.map(|error| error.p99),
+            error_px_max: error_px.map(|error| error.max),
+            depth_error_m_p99: errors.and_then(Summary::depth_m).map(|depth| depth.p99),
+            mismatch: error_px.and(errors).map(Summary::mismatch),
+            checked_pixels: errors.map(Summary::samples),
+        }
+    }
+}
+
+impl WorkerEntry {
+    /// What the farm says of a worker.
+    pub fn new(share: &WorkerShare) -> Self {
+        WorkerEntry {
+            name: share.name.clone(),
+            jobs: share.jobs,
+            render_ms: share.cost_us as f64 / 1e3,
+        }
+    }
 }
 
 impl Manifest {

@@ -191,6 +191,18 @@ pub fn pixels_sha256(picture: &Rgb8) -> BlobHash {
     BlobHash(Sha256::digest(picture.pixels()).into())
 }
 
+/// Shown instead of a frame that could not be rendered: nobody takes it for terrain.
+const FAILED_FRAME_RGB: [u8; 3] = [255, 0, 255];
+
+/// What stands in place of a frame that could not be rendered.
+pub fn failed_frame(width: u32, height: u32) -> Rgb8 {
+    let mut picture = Rgb8::new(width, height);
+    for pixel in picture.pixels_mut().chunks_exact_mut(3) {
+        pixel.copy_from_slice(&FAILED_FRAME_RGB);
+    }
+    picture
+}
+
 fn ends_with_separator(path: &Path) -> bool {
     path.as_os_str().to_str().is_some_and(|text| text.ends_with(std::path::is_separator))
 }

@@ -89,10 +89,15 @@ impl Peer {
         self.connection.send(&message.into()).await.unwrap();
     }
 
-    /// The next message; `None` at a clean end.
+    /// The next message that does not say how fast the worker is; `None` at a clean end.
     pub async fn recv(&mut self) -> Option<Message> {
-        let received = tokio::time::timeout(PATIENCE, self.connection.recv());
-        received.await.expect("the worker says something").unwrap()
+        loop {
+            let received = tokio::time::timeout(PATIENCE, self.connection.recv());
+            let message = received.await.expect("the worker says something").unwrap();
+            if !matches!(message, Some(Message::Speed(_))) {
+                return message;
+            }
+        }
     }
 
     /// The next message that is no question for blobs; those are answered, the last one

@@ -104,6 +104,15 @@ impl<W: AsyncWrite + Unpin> Writer<W> {
 }
 
 impl OutboxEnd {
+    /// The next message, urgent ones first, for a peer inside this process; `None` when
+    /// every [`Outbox`] is dropped and all is taken. Cancel safe.
+    pub async fn recv(&mut self) -> Option<Message> {
+        match self.next(false).await {
+            Next::Urgent(message) | Next::Bulk(message) => Some(message),
+            Next::Part | Next::End => None,
+        }
+    }
+
     async fn next(&mut self, in_train: bool) -> Next {
         if in_train {
             return self.urgent.try_recv().map_or(Next::Part, Next::Urgent);

@@ -4,6 +4,7 @@
 //! can be typed: letters of either case, no `I`, `L`, `O` or `U`, each group with a
 //! check of its own, so that a typo is named by its group. Not here: where it is kept.
 
+use sha2::{Digest, Sha256};
 use std::fmt;
 use std::str::FromStr;
 
@@ -74,6 +75,12 @@ impl FarmToken {
         &self.0
     }
 
+    /// A secret for another purpose, from which nobody learns the token or the secret of a
+    /// third purpose: HMAC-SHA-256 of `purpose` under the token (RFC 2104).
+    pub fn derive(&self, purpose: &str) -> [u8; TOKEN_BYTES] {
+        hmac_sha256(&self.0, purpose.as_bytes())
+    }
+
     /// The token as it is typed: whoever reads it can join the farm.
     pub fn to_text(&self) -> String {
         let (words, _) = self.0.as_chunks::<4>();
@@ -124,6 +131,19 @@ impl fmt::Debug for FarmToken {
     }
 }
 
+/// HMAC-SHA-256 with a key that is no longer than a block.
+fn hmac_sha256(key: &[u8; TOKEN_BYTES], text: &[u8]) -> [u8; 32] {
+    let pad = |with: u8| {
+        let mut block = [with; 64];
+        for (byte, key) in block.iter_mut().zip(key) {
+            *byte ^= key;
+        }
+        Sha256::new().chain_update(block)
+    };
+    let inner = pad(0x36).chain_update(text).finalize();
+    pad(0x5c).chain_update(inner).finalize().into()
+}
+
 /// What a symbol stands for; look-alikes are taken for what they look like.
 fn value_of(symbol: char) -> Option<u64> {
     let symbol = match symbol.to_ascii_uppercase() {
@@ -167,6 +187,17 @@ mod tests {
         assert_ne!(one.0, other.0);
         assert_ne!(one.0, [0; TOKEN_BYTES]);
         assert_eq!(format!("{one:?}"), "FarmToken(secret)");
+    }
+
+    #[test]
+    fn derived_secrets_differ_by_purpose_and_are_those_of_hmac_sha_256() {
+        // Test case 2 of RFC 4231: a short key is one that ends in zeros.
+        let mut key = [0; TOKEN_BYTES];
+        key[..4].copy_from_slice(b"Jefe");
+        let mac = FarmToken(key).derive("what do ya want for nothing?");
+        let hex: String = mac.iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(hex, "5bdcc146bf60754e6a042426089575c75a003f089d2739839dec58b964ec3843");
+        assert_ne!(FarmToken(key).derive("one"), FarmToken(key).derive("other"));
     }
 
     #[test]

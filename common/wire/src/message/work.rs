@@ -319,6 +319,22 @@ impl Body for Failed {
     }
 }
 
+/// How fast a worker renders a small scene that is the same on every PC: said once, after
+/// the welcome. It guides the first jobs only; after them, their own times do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Speed {
+    /// Pixels in a second on all threads, at least 1.
+    pub pixels_per_s: u64,
+}
+
+impl Body for Speed {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        Unfit::unless(self.pixels_per_s > 0, "a worker that renders nothing")
+    }
+}
+
 /// Jobs that were not begun and will not be.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HandBack {

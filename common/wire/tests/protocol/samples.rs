@@ -206,6 +206,7 @@ pub fn all() -> Vec<(String, Message)> {
             body: b"{}"[..].into(),
         }
         .into(),
+        Speed { pixels_per_s: 31_415_926 }.into(),
     ];
     let mut seen = 0;
     let named = messages.into_iter().map(|message| {

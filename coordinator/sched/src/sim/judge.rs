@@ -74,6 +74,7 @@ pub(crate) struct Judge {
     pub(crate) copies: u64,
     /// Connected workers; whether they drain.
     workers: BTreeMap<WorkerId, bool>,
+    distrusted: BTreeSet<WorkerId>,
     shots: BTreeMap<ShotId, Watched>,
     held: BTreeMap<LeaseId, (WorkerId, ShotId, FrameIndex)>,
     /// The same leases, by their holders.
@@ -118,11 +119,13 @@ impl Judge {
                     shot.untaken.remove(frame);
                 }
             }
+            Event::WorkerCleared { worker, .. } => _ = self.distrusted.remove(worker),
             Event::ShotCanceled { shot } => _ = self.shots.remove(shot),
             Event::ShotPaused { .. }
             | Event::ShotResumed { .. }
             | Event::ShotPrioritised { .. }
-            | Event::WorkerCleared { .. }
+            | Event::WorkerDistrusted { .. }
+            | Event::WorkerMeasured { .. }
             | Event::HeardFrom { .. }
             | Event::Tick => {}
         }
@@ -134,6 +137,34 @@ impl Judge {
             Action::Grant { worker, lease, shot, frame, region } => {
                 self.granted(*worker, *lease, *shot, *frame, *region);
             }
+            Action::Audit { worker, lease, shot, frame, .. } => {
+                self.newest(*lease);
+                let may_work = self.may_work(*worker, *shot);
+                self.expect(may_work, |v| &mut v.bad_grants, || format!("{worker} got {lease}"));
+                self.held.insert(*lease, (*worker, *shot, *frame));
+            }
+            Action::Compared { worker, lease, .. } => {
+                let was_awaited = self.awaiting.take() == Some((*worker, *lease));
+                let is_right = self.end(*worker, *lease).is_some() && was_awaited;
+                self.expect(is_right, |v| &mut v.verdicts, || format!("{lease} wrongly compared"));
+            }
+            Action::Retract { shot, frame, region, .. } => {
+                let shot = self.shots.get_mut(shot);
+                let picture = shot.and_then(|shot| shot.open.get_mut(frame));
+                let at = picture.as_ref().and_then(|picture| {
+                    picture.accepted.iter().position(|accepted| accepted == region)
+                });
+                if let (Some(picture), Some(at)) = (picture, at) {
+                    picture.accepted.swap_remove(at);
+                }
+                let was_there = at.is_some();
+                self.expect(
+                    was_there,
+                    |v| &mut v.pixels_twice,
+                    || format!("{region:?} taken back"),
+                );
+            }
+            Action::Distrusted { worker, .. } => _ = self.distrusted.insert(*worker),
             Action::Revoke { worker, lease } => {
                 let is_held = self.end(*worker, *lease).is_some();
                 self.expect(is_held, |v| &mut v.lease_ends, || format!("{lease} ended twice"));
@@ -171,7 +202,7 @@ impl Judge {
                     shot.blocked.remove(worker);
                 }
             }
-            Action::Probe { .. } => {}
+            Action::Trusted { .. } | Action::Disputed { .. } | Action::Probe { .. } => {}
         }
     }
 
@@ -214,11 +245,8 @@ impl Judge {
         frame: u32,
         region: Region,
     ) {
-        let is_newer = lease.0 > self.last_lease;
-        self.expect(is_newer, |v| &mut v.lease_order, || format!("{lease} is not the largest"));
-        self.last_lease = self.last_lease.max(lease.0);
-        let may_work = self.workers.get(&worker) == Some(&false)
-            && self.shots.get(&id).is_some_and(|shot| !shot.blocked.contains(&worker));
+        self.newest(lease);
+        let may_work = self.may_work(worker, id);
         self.expect(may_work, |v| &mut v.bad_grants, || format!("{worker} got {lease}"));
         self.held.insert(lease, (worker, id, frame));
         self.held_by.entry(worker).or_default().insert(lease);
@@ -240,6 +268,18 @@ impl Judge {
             || format!("{lease} of frame {frame} granted for {region:?}, also held or there"),
         );
         self.expect(fits, |v| &mut v.in_flight, || format!("{in_flight} frames in flight"));
+    }
+
+    fn newest(&mut self, lease: LeaseId) {
+        let is_newer = lease.0 > self.last_lease;
+        self.expect(is_newer, |v| &mut v.lease_order, || format!("{lease} is not the largest"));
+        self.last_lease = self.last_lease.max(lease.0);
+    }
+
+    fn may_work(&self, worker: WorkerId, id: ShotId) -> bool {
+        self.workers.get(&worker) == Some(&false)
+            && !self.distrusted.contains(&worker)
+            && self.shots.get(&id).is_some_and(|shot| !shot.blocked.contains(&worker))
     }
 
     fn accepted(&mut self, lease: LeaseId, id: ShotId, frame: FrameIndex, region: Region) {
@@ -365,7 +405,7 @@ mod tests {
 
     fn accept(judge: &mut Judge, lease: u64) {
         let lease = LeaseId(lease);
-        judge.event(&Event::JobDone { worker: WORKER, lease, cost_us: 1 });
+        judge.event(&Event::JobDone { worker: WORKER, lease, cost_us: 1, digest: 0 });
         judge.action(&Action::Accept { lease, shot: SHOT, frame: 0, region: WHOLE });
     }
 
@@ -394,7 +434,7 @@ mod tests {
         accept(&mut judge, 3);
         assert_eq!(judge.violations.verdicts, 1);
         assert_eq!(judge.violations.pixels_twice, 1);
-        judge.event(&Event::JobDone { worker: WORKER, lease: LeaseId(4), cost_us: 1 });
+        judge.event(&Event::JobDone { worker: WORKER, lease: LeaseId(4), cost_us: 1, digest: 0 });
         judge.settled();
         assert_eq!(judge.violations.verdicts, 2);
         judge.action(&Action::FrameComplete { shot: SHOT, frame: 1 });

@@ -142,7 +142,9 @@ impl World<'_> {
             self.send_up(i, Event::JobFailed { worker, lease, reason }, SMALL_BYTES, false);
         } else {
             let bytes = running.job.region.area() as f64 * self.config.bytes_per_px;
-            self.send_up(i, Event::JobDone { worker, lease, cost_us }, bytes, false);
+            // Everyone renders the same.
+            let digest = 0;
+            self.send_up(i, Event::JobDone { worker, lease, cost_us, digest }, bytes, false);
         }
         if self.machines[i].is_leaving {
             self.leave(i, worker);
@@ -162,7 +164,8 @@ impl World<'_> {
             return;
         }
         match action {
-            Action::Grant { lease, shot, frame, region, .. } => {
+            Action::Grant { lease, shot, frame, region, .. }
+            | Action::Audit { lease, shot, frame, region, .. } => {
                 let running = machine.running.map(|running| running.job.lease);
                 let has_it = machine.queue.iter().any(|job| job.lease == lease);
                 if machine.is_leaving {

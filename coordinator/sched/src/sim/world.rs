@@ -272,7 +272,9 @@ impl<'a> World<'a> {
                 self.tally.dropped(now_us, worker);
                 self.send_down(worker, action);
             }
-            Action::Revoke { worker, .. } | Action::Probe { worker } => {
+            Action::Audit { worker, .. }
+            | Action::Revoke { worker, .. }
+            | Action::Probe { worker } => {
                 self.send_down(worker, action);
             }
             Action::Accept { frame, region, .. } => {
@@ -294,7 +296,13 @@ impl<'a> World<'a> {
                 self.shots_left -= 1;
                 self.tally.shot_over(now_us);
             }
-            Action::Blocked { .. } | Action::Unblocked { .. } => {}
+            Action::Compared { .. }
+            | Action::Retract { .. }
+            | Action::Distrusted { .. }
+            | Action::Trusted { .. }
+            | Action::Disputed { .. }
+            | Action::Blocked { .. }
+            | Action::Unblocked { .. } => {}
         }
     }
 

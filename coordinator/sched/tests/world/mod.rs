@@ -13,6 +13,18 @@ pub const SECOND: u64 = 1_000_000;
 /// Size of every frame, pixels.
 pub const SIZE: (u32, u32) = (1920, 100);
 
+/// What a machine makes of its jobs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pixels {
+    /// What everyone does.
+    #[default]
+    Right,
+    /// Something else, the same each time.
+    Wrong,
+    /// Something else each time, of every so many jobs.
+    Unsteady(u64),
+}
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Job {
     pub lease: LeaseId,
@@ -26,6 +38,8 @@ pub struct Job {
 pub struct Machine {
     /// Work of a microsecond.
     pub speed: f64,
+    /// What it makes of them.
+    pub pixels: Pixels,
     /// Jobs that wait.
     pub queue: VecDeque<Job>,
     /// What it renders: the job, when it began, when it ends.
@@ -120,7 +134,13 @@ impl World {
         let mut taken = Vec::new();
         while let Some(action) = self.scheduler.poll_action() {
             match action {
-                Action::Grant { .. } | Action::Revoke { .. } | Action::Probe { .. } => {
+                Action::Grant { .. }
+                | Action::Audit { .. }
+                | Action::Revoke { .. }
+                | Action::Probe { .. } => {
+                    self.said.extend(
+                        matches!(action, Action::Audit { .. }).then(|| (self.now, action.clone())),
+                    );
                     self.later(self.wire_us, Happening::ToWorker(action));
                 }
                 Action::FrameComplete { shot, frame } => {
@@ -142,7 +162,10 @@ impl World {
     fn happen(&mut self, happening: Happening) {
         match happening {
             Happening::ToScheduler(event) => self.tell(event),
-            Happening::ToWorker(Action::Grant { worker, lease, shot, frame, region }) => {
+            Happening::ToWorker(
+                Action::Grant { worker, lease, shot, frame, region }
+                | Action::Audit { worker, lease, shot, frame, region, .. },
+            ) => {
                 let machine = self.machines.get_mut(&worker).unwrap();
                 machine.queue.push_back(Job { lease, shot, frame, region });
                 self.begin(worker);
@@ -184,7 +207,13 @@ impl World {
         };
         let cost_us = ends - began;
         *machine.worked.entry(job.shot).or_default() += cost_us as f64 * machine.speed;
-        let done = Event::JobDone { worker, lease, cost_us };
+        let digest = match machine.pixels {
+            Pixels::Right => 0,
+            Pixels::Wrong => worker.0,
+            Pixels::Unsteady(jobs) if lease.0.is_multiple_of(jobs) => u64::MAX - lease.0,
+            Pixels::Unsteady(_) => 0,
+        };
+        let done = Event::JobDone { worker, lease, cost_us, digest };
         self.later(self.wire_us, Happening::ToScheduler(done));
         self.begin(worker);
     }

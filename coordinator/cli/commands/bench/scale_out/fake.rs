@@ -198,7 +198,7 @@ struct Started {
 async fn start_coordinator() -> anyhow::Result<Started> {
     let program = std::env::current_exe().context("cannot find this program's own file")?;
     let mut child = Command::new(&program)
-        .args(["coordinator", "--listen", "127.0.0.1:0"])
+        .args(["coordinator", "--listen", "127.0.0.1:0", "--no-http"])
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .kill_on_drop(true)

@@ -1,0 +1,155 @@
+//! The side that asks the coordinator's API over the link of the farm: the same address
+//! and the same token as workers and renders have.
+
+use bytes::Bytes;
+use std::time::Duration;
+use terrafarm_wire::limits::{DESK_BODY_MAX, PATH_BYTES_MAX};
+use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Trust};
+use terrafarm_wire::message::{Hello, Message, Request, Role, Verb};
+use tokio::net::TcpStream;
+
+/// How long connecting and greeting may take.
+const GREETING_LIMIT: Duration = Duration::from_secs(5);
+/// How long an answer may take: that of the longest submission, and some.
+const ANSWER_LIMIT: Duration = Duration::from_secs(300);
+
+/// A line to a coordinator's desk.
+#[derive(Debug)]
+pub struct Line {
+    address: String,
+    connection: Connection<TcpStream>,
+    number: u32,
+}
+
+/// What the API answered; its status is 200 or 206.
+#[derive(Debug)]
+pub struct Answer {
+    /// How long the whole content is, bytes; `body` is all of it unless a range was asked.
+    pub total: u64,
+    /// JSON, or a file.
+    pub body: Bytes,
+}
+
+/// Why there is no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    /// Nobody is there.
+    #[error(
+        "cannot reach coordinator {address}: {source}; is \"terrafarm coordinator\" running there, \
+         and the port open?"
+    )]
+    Connect {
+        /// Where.
+        address: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Somebody is there, but no coordinator that lets us in.
+    #[error("coordinator {address}: {source}")]
+    Handshake {
+        /// Where.
+        address: String,
+        /// What went wrong.
+        source: HandshakeError,
+    },
+    /// The connection was lost.
+    #[error("coordinator {address} was lost: {source}; what it had acknowledged stays")]
+    Lost {
+        /// Where.
+        address: String,
+        /// What happened.
+        source: LinkError,
+    },
+    /// It does not answer.
+    #[error("coordinator {0} has not answered for {limit} s", limit = ANSWER_LIMIT.as_secs())]
+    Silent(String),
+    /// It speaks, but not of what was asked.
+    #[error("coordinator {0} answers with something else; is it of the same version?")]
+    OutOfPlace(String),
+    /// What is asked is too long.
+    #[error("{what} has {bytes} bytes; at most {most} can be sent")]
+    TooLong {
+        /// Which part.
+        what: &'static str,
+        /// How long it is.
+        bytes: usize,
+        /// How long it may be.
+        most: usize,
+    },
+    /// The coordinator says no.
+    #[error("{text}")]
+    Refused {
+        /// As in HTTP.
+        status: u16,
+        /// Why, and what to do.
+        text: String,
+    },
+}
+
+impl Line {
+    /// Connects over a link that `trust` allows.
+    ///
+    /// # Errors
+    /// If there is no coordinator, or it does not let us in.
+    pub async fn open(address: &str, trust: &Trust) -> Result<Self, AskError> {
+        let unreachable = |source| AskError::Connect { address: address.into(), source };
+        let connecting = tokio::time::timeout(GREETING_LIMIT, TcpStream::connect(address));
+        let late = |_| unreachable(std::io::ErrorKind::TimedOut.into());
+        let stream = connecting.await.map_err(late)?.map_err(unreachable)?;
+        let _ = stream.set_nodelay(true);
+        let refused = |source| AskError::Handshake { address: address.into(), source };
+        let peer = stream.peer_addr().map_err(unreachable)?;
+        let token = trust.token_for(peer.ip()).map_err(refused)?;
+        let hello = Hello::new("desk", Role::Desk);
+        let greeted = link::greet(stream, token, hello, GREETING_LIMIT).await;
+        let (connection, _welcome) = greeted.map_err(refused)?;
+        Ok(Line { address: address.to_owned(), connection, number: 0 })
+    }
+
+    /// Asks for something; `range` is the first byte of the content and how many.
+    ///
+    /// # Errors
+    /// If the line breaks, or the coordinator refuses.
+    pub async fn ask(
+        &mut self,
+        verb: Verb,
+        path: &str,
+        range: Option<(u64, u64)>,
+        body: Bytes,
+    ) -> Result<Answer, AskError> {
+        let lengths =
+            [("the address", path.len(), PATH_BYTES_MAX), ("the body", body.len(), DESK_BODY_MAX)];
+        for (what, bytes, most) in lengths {
+            if bytes > most {
+                return Err(AskError::TooLong { what, bytes, most });
+            }
+        }
+        self.number = self.number.wrapping_add(1);
+        let request = Request { number: self.number, verb, path: path.to_owned(), range, body };
+        let exchange = async {
+            self.connection.send(&request.into()).await?;
+            self.connection.recv().await
+        };
+        let address = || self.address.clone();
+        let answered = tokio::time::timeout(ANSWER_LIMIT, exchange).await;
+        let response = match answered.map_err(|_| AskError::Silent(address()))? {
+            Ok(Some(Message::Response(response))) if response.number == self.number => response,
+            Ok(Some(_)) => return Err(AskError::OutOfPlace(address())),
+            Ok(None) => {
+                return Err(AskError::Lost { address: address(), source: LinkError::Closed });
+            }
+            Err(source) => return Err(AskError::Lost { address: address(), source }),
+        };
+        match response.status {
+            200 | 206 => Ok(Answer { total: response.total, body: response.body }),
+            status => Err(AskError::Refused { status, text: reason(&response.body) }),
+        }
+    }
+}
+
+/// The words of a refusal.
+fn reason(body: &[u8]) -> String {
+    let json: Option<serde_json::Value> = serde_json::from_slice(body).ok();
+    let said = json.as_ref().and_then(|json| json["error"].as_str());
+    said.unwrap_or("the coordinator refused, and did not say why").to_owned()
+}

@@ -1,0 +1,221 @@
+//! Terrain of the queue: one file a blob, named by its hash.
+//!
+//! A blob is checked when it comes and each time it is read: a damaged one is removed, so
+//! that it counts as missing and is sent again. Blobs are synced when a shot that needs
+//! them is taken, not one by one.
+
+use super::{QueueConfig, QueueError, disk};
+use bytes::Bytes;
+use std::collections::HashSet;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
+use terrafarm_common::id::BlobHash;
+use terrafarm_terrain::store::{decode_index, hash_of};
+use terrafarm_wire::limits::BLOB_BYTES_MAX;
+
+/// The terrain of the queue.
+#[derive(Debug)]
+pub struct Blobs {
+    config: Arc<QueueConfig>,
+    folder: PathBuf,
+    /// Those that came and are not yet known to be on the disk.
+    unsynced: Mutex<HashSet<BlobHash>>,
+    count: AtomicU64,
+}
+
+impl Blobs {
+    /// In the folder of a queue.
+    pub fn new(config: &Arc<QueueConfig>) -> Self {
+        Blobs {
+            config: config.clone(),
+            folder: config.folder.join("blobs"),
+            unsynced: Mutex::default(),
+            count: AtomicU64::new(0),
+        }
+    }
+
+    /// The folder of the queue.
+    pub fn queue(&self) -> &Path {
+        &self.config.folder
+    }
+
+    fn shelf(&self, hash: BlobHash) -> PathBuf {
+        self.folder.join(&hash.to_hex()[..2])
+    }
+
+    fn path(&self, hash: BlobHash) -> PathBuf {
+        let name = hash.to_hex();
+        self.folder.join(&name[..2]).join(name)
+    }
+
+    fn error(&self, what: &'static str, path: &Path, why: &io::Error) -> QueueError {
+        disk::error(&self.config.folder, what, path, why)
+    }
+
+    /// Fails if the disk has no more than the reserve.
+    ///
+    /// # Errors
+    /// [`QueueError::DiskFull`].
+    pub fn has_room(&self) -> Result<(), QueueError> {
+        disk::has_room(&self.config.folder, self.config.reserve_bytes, 0)
+    }
+
+    /// Those that are not here; the others stay for the time of grace from now on.
+    pub fn missing(&self, hashes: Vec<BlobHash>) -> Vec<BlobHash> {
+        let now = SystemTime::now();
+        hashes.into_iter().filter(|&hash| !self.touch(hash, now)).collect()
+    }
+
+    /// Marks a blob as used now; returns whether it is here.
+    fn touch(&self, hash: BlobHash, now: SystemTime) -> bool {
+        let file = File::options().append(true).open(self.path(hash));
+        // One that cannot be marked is here all the same.
+        file.map(|file| file.set_modified(now)).is_ok()
+    }
+
+    /// Keeps a blob.
+    ///
+    /// # Errors
+    /// If it is not what it is called, too long, or there is no room.
+    pub fn put(&self, hash: BlobHash, bytes: &[u8]) -> Result<(), QueueError> {
+        if bytes.len() > BLOB_BYTES_MAX {
+            let length = bytes.len();
+            return Err(QueueError::Unfit(format!("a blob of {length} bytes is too long")));
+        }
+        let found = hash_of(bytes);
+        if found != hash {
+            return Err(QueueError::WrongBlob { expected: hash, found });
+        }
+        if self.touch(hash, SystemTime::now()) {
+            return Ok(());
+        }
+        disk::has_room(&self.config.folder, self.config.reserve_bytes, bytes.len() as u64)?;
+        let shelf = self.shelf(hash);
+        fs::create_dir_all(&shelf).map_err(|why| self.error("make the folder", &shelf, &why))?;
+        let count = self.count.fetch_add(1, Ordering::Relaxed);
+        let beside = shelf.join(format!(".{}-{count}.partial", std::process::id()));
+        let written = File::create(&beside)
+            .and_then(|mut file| file.write_all(bytes))
+            .and_then(|()| fs::rename(&beside, self.path(hash)));
+        if let Err(why) = written {
+            let _ = fs::remove_file(&beside);
+            return Err(self.error("write", &self.path(hash), &why));
+        }
+        self.unsynced().insert(hash);
+        Ok(())
+    }
+
+    /// A blob; `None` if it is not here, or was damaged and is no longer.
+    ///
+    /// # Errors
+    /// If the disk cannot read it.
+    pub fn read(&self, hash: BlobHash) -> Result<Option<Bytes>, QueueError> {
+        let path = self.path(hash);
+        let wrong = |why: &io::Error| self.error("read", &path, why);
+        let file = match File::open(&path) {
+            Ok(file) => file,
+            Err(why) if why.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(why) => return Err(wrong(&why)),
+        };
+        let mut bytes = Vec::new();
+        let limit = BLOB_BYTES_MAX as u64 + 1;
+        file.take(limit).read_to_end(&mut bytes).map_err(|why| wrong(&why))?;
+        if hash_of(&bytes) == hash {
+            return Ok(Some(bytes.into()));
+        }
+        tracing::warn!(%hash, "a blob of terrain is damaged on the disk; it has to be sent again");
+        fs::remove_file(&path).map_err(|why| self.error("remove", &path, &why))?;
+        Ok(None)
+    }
+
+    /// The hashes of all blobs of a store, its index first.
+    ///
+    /// # Errors
+    /// [`QueueError::Missing`] if its index is not here, [`QueueError::Unfit`] if it is
+    /// none.
+    pub fn store(&self, index: BlobHash) -> Result<Vec<BlobHash>, QueueError> {
+        let bytes = self.read(index)?.ok_or_else(|| QueueError::Missing(vec![index]))?;
+        let unfit = |why| QueueError::Unfit(format!("{index} is no index of terrain: {why}"));
+        let store = decode_index(&bytes).map_err(unfit)?;
+        let levels = store.layers.iter().flat_map(|layer| &layer.levels);
+        let tiles = levels.flat_map(|level| &level.entries).filter(|tile| !tile.is_empty());
+        Ok(std::iter::once(index).chain(tiles.map(|tile| tile.hash)).collect())
+    }
+
+    /// Makes sure that a store is here, all of it, and stays when the power fails.
+    ///
+    /// # Errors
+    /// [`QueueError::Missing`] with what is not here.
+    pub fn complete(&self, index: BlobHash) -> Result<(), QueueError> {
+        let all = self.store(index)?;
+        let missing = self.missing(all.clone());
+        if !missing.is_empty() {
+            return Err(QueueError::Missing(missing));
+        }
+        let unsynced: Vec<_> = {
+            let unsynced = self.unsynced();
+            all.into_iter().filter(|hash| unsynced.contains(hash)).collect()
+        };
+        let shelves: HashSet<_> = unsynced.iter().map(|&hash| self.shelf(hash)).collect();
+        for &hash in &unsynced {
+            let path = self.path(hash);
+            let synced = File::options().append(true).open(&path).and_then(|file| file.sync_all());
+            synced.map_err(|why| self.error("sync", &path, &why))?;
+        }
+        let folders = shelves.iter().map(PathBuf::as_path);
+        for folder in folders.chain([self.folder.as_path()]) {
+            disk::sync_folder(folder).map_err(|why| self.error("sync", folder, &why))?;
+        }
+        self.unsynced().retain(|hash| !unsynced.contains(hash));
+        Ok(())
+    }
+
+    /// Removes what no unfinished shot needs and nobody asked for lately, the longest
+    /// unused first, until the rest is within its limit. Returns bytes removed.
+    ///
+    /// # Errors
+    /// If the index of a store in use cannot be read: then nothing is removed.
+    pub fn sweep(&self, in_use: &HashSet<BlobHash>) -> Result<u64, QueueError> {
+        let mut needed = HashSet::new();
+        for &index in in_use {
+            needed.extend(self.store(index)?.into_iter().map(BlobHash::to_hex));
+        }
+        let now = SystemTime::now();
+        let mut idle = Vec::new();
+        let mut idle_bytes = 0;
+        for shelf in entries(&self.folder) {
+            for blob in entries(&shelf.path()) {
+                let Ok(facts) = blob.metadata() else { continue };
+                if blob.file_name().to_str().is_some_and(|name| needed.contains(name)) {
+                    continue;
+                }
+                idle_bytes += facts.len();
+                idle.push((facts.modified().unwrap_or(now), facts.len(), blob.path()));
+            }
+        }
+        idle.sort();
+        let mut removed = 0;
+        for (used, bytes, path) in idle {
+            let young = now.duration_since(used).unwrap_or_default() < self.config.terrain_grace;
+            if idle_bytes - removed <= self.config.terrain_cache_bytes || young {
+                break;
+            }
+            fs::remove_file(&path).map_err(|why| self.error("remove", &path, &why))?;
+            removed += bytes;
+        }
+        Ok(removed)
+    }
+
+    fn unsynced(&self) -> std::sync::MutexGuard<'_, HashSet<BlobHash>> {
+        self.unsynced.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What is in a folder; nothing if it is not there.
+fn entries(folder: &Path) -> impl Iterator<Item = fs::DirEntry> {
+    fs::read_dir(folder).into_iter().flatten().flatten()
+}

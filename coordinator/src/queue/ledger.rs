@@ -1,0 +1,480 @@
+//! The records of the queue, in one redb file.
+//!
+//! Every call is one transaction and is on the disk when it returns. After an error of
+//! the disk the file is closed and opened again by the next call: redb goes back to its
+//! last transaction then, however the disk failed.
+//!
+//! | table | key | value |
+//! |---|---|---|
+//! | `meta` | `version`, `last` | version of this format; last number given to a shot |
+//! | `shots` | shot | [`ShotRecord`], JSON |
+//! | `cameras` | shot, piece | up to 1024 cameras of 13 f64 each, little endian |
+//! | `frames` | shot, index | [`FrameRecord`], JSON |
+//! | `progress` | shot | frames done, frames failed, last one done + 1 |
+
+use super::QueueError;
+use super::plan::ShotPlan;
+use crate::sink::manifest::{FrameEntry, WorkerEntry};
+use redb::{Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTransaction};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::{FrameIndex, ShotId};
+
+/// The format that this program reads and writes.
+const VERSION: u64 = 1;
+/// Cameras of one record.
+const PIECE: usize = 1024;
+/// Numbers of one camera: four vectors and the field of view.
+const CAMERA_NUMBERS: usize = 13;
+/// Memory that redb may take for pages, bytes.
+const CACHE_BYTES: usize = 32 << 20;
+
+const META: TableDefinition<&str, u64> = TableDefinition::new("meta");
+const SHOTS: TableDefinition<u64, &[u8]> = TableDefinition::new("shots");
+const CAMERAS: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("cameras");
+const FRAMES: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("frames");
+const PROGRESS: TableDefinition<u64, (u32, u32, u32)> = TableDefinition::new("progress");
+
+/// How far a shot has come, as it is kept. What it does at the moment follows from it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// Frames are missing.
+    Open,
+    /// Frames are missing, and someone wants it to wait.
+    Paused,
+    /// Manifest and film are missing.
+    Finishing,
+    /// All is there.
+    Done,
+    /// It was given up.
+    Failed,
+    /// Someone canceled it.
+    Canceled,
+}
+
+impl Stage {
+    /// Whether nothing is left to do.
+    pub fn is_over(self) -> bool {
+        matches!(self, Stage::Done | Stage::Failed | Stage::Canceled)
+    }
+}
+
+/// One shot, without its cameras.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ShotRecord {
+    /// What was submitted; the cameras are kept apart.
+    pub plan: ShotPlan,
+    /// Number of frames.
+    pub frames: u32,
+    /// When it was submitted, seconds since 1970.
+    pub submitted_s: u64,
+    /// How far it has come.
+    pub stage: Stage,
+    /// Why, where that needs saying.
+    pub note: String,
+    /// Who rendered, as far as the farm has said.
+    pub workers: Vec<WorkerEntry>,
+}
+
+/// What became of one frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FrameRecord {
+    /// Its picture is on the disk.
+    Done {
+        /// Its entry in the manifest.
+        entry: FrameEntry,
+        /// Size of the picture's file, bytes.
+        bytes: u64,
+    },
+    /// It could not be rendered, for this reason.
+    Failed(String),
+}
+
+/// How many frames of a shot are over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Progress {
+    /// Finished.
+    pub done: u32,
+    /// Given up.
+    pub failed: u32,
+    /// The one that was finished last.
+    pub last: Option<FrameIndex>,
+}
+
+impl Progress {
+    /// Frames that are over.
+    pub fn over(self) -> u32 {
+        self.done + self.failed
+    }
+
+    fn from_row((done, failed, next): (u32, u32, u32)) -> Self {
+        Progress { done, failed, last: next.checked_sub(1) }
+    }
+
+    fn row(self) -> (u32, u32, u32) {
+        (self.done, self.failed, self.last.map_or(0, |last| last.saturating_add(1)))
+    }
+}
+
+/// A shot as it was read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Saved {
+    /// Its number.
+    pub id: ShotId,
+    /// What is kept of it.
+    pub record: ShotRecord,
+    /// How far it is.
+    pub progress: Progress,
+}
+
+/// Opens the file; again and again, if need be.
+type Opener = Box<dyn Fn() -> Result<Database, redb::DatabaseError> + Send>;
+
+/// The records.
+pub struct Ledger {
+    path: PathBuf,
+    opener: Opener,
+    /// `None` after an error of the disk.
+    database: Option<Database>,
+}
+
+impl Ledger {
+    /// Opens the file, or makes it.
+    ///
+    /// # Errors
+    /// If it is no queue, a newer one, damaged, or the disk fails.
+    pub fn open(path: &Path) -> Result<Self, QueueError> {
+        let file = path.to_path_buf();
+        let opener = move || Database::builder().set_cache_size(CACHE_BYTES).create(&file);
+        Self::with(path, Box::new(opener))
+    }
+
+    /// As [`Ledger::open`], with another way to the file.
+    pub(super) fn with(path: &Path, opener: Opener) -> Result<Self, QueueError> {
+        let mut ledger = Ledger { path: path.to_path_buf(), opener, database: None };
+        let version = ledger.write(|transaction| {
+            transaction.open_table(SHOTS)?;
+            transaction.open_table(CAMERAS)?;
+            transaction.open_table(FRAMES)?;
+            transaction.open_table(PROGRESS)?;
+            let mut meta = transaction.open_table(META)?;
+            let version = meta.get("version")?.map(|version| version.value());
+            if version.is_none() {
+                meta.insert("version", VERSION)?;
+            }
+            Ok(version.unwrap_or(VERSION))
+        })?;
+        if version != VERSION {
+            return Err(ledger.damaged(format!(
+                "it has format {version}, this program knows {VERSION}; use the program that wrote it"
+            )));
+        }
+        Ok(ledger)
+    }
+
+    /// All shots by number, and the last number given.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    pub fn load(&mut self) -> Result<(u64, Vec<Saved>), QueueError> {
+        let (last, rows) = self.read(|transaction| {
+            let last = transaction.open_table(META)?.get("last")?.map_or(0, |last| last.value());
+            let progress = transaction.open_table(PROGRESS)?;
+            let mut rows = Vec::new();
+            for row in transaction.open_table(SHOTS)?.iter()? {
+                let (id, record) = row?;
+                let far = progress.get(id.value())?.map(|far| far.value()).unwrap_or_default();
+                rows.push((ShotId(id.value()), record.value().to_vec(), Progress::from_row(far)));
+            }
+            Ok((last, rows))
+        })?;
+        let saved = rows.into_iter().map(|(id, record, progress)| {
+            let record = self.parse(&format!("{id}"), &record)?;
+            Ok(Saved { id, record, progress })
+        });
+        Ok((last, saved.collect::<Result<_, QueueError>>()?))
+    }
+
+    /// Adds a shot and its cameras.
+    ///
+    /// # Errors
+    /// If it cannot be written; then nothing is.
+    pub fn add(
+        &mut self,
+        id: ShotId,
+        record: &ShotRecord,
+        cameras: &[Camera],
+    ) -> Result<(), QueueError> {
+        let record = self.text(record)?;
+        self.write(|transaction| {
+            transaction.open_table(META)?.insert("last", id.0)?;
+            transaction.open_table(SHOTS)?.insert(id.0, record.as_slice())?;
+            let mut table = transaction.open_table(CAMERAS)?;
+            for (piece, cameras) in (0..).zip(cameras.chunks(PIECE)) {
+                table.insert((id.0, piece), pack(cameras).as_slice())?;
+            }
+            Ok(())
+        })
+    }
+
+    /// Writes a shot that is there already.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn put(&mut self, id: ShotId, record: &ShotRecord) -> Result<(), QueueError> {
+        let record = self.text(record)?;
+        self.write(|transaction| {
+            transaction.open_table(SHOTS)?.insert(id.0, record.as_slice())?;
+            Ok(())
+        })
+    }
+
+    /// Keeps what became of frames, all or none of them, and returns how far their shots
+    /// are.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn record(
+        &mut self,
+        frames: &[(ShotId, FrameIndex, FrameRecord)],
+    ) -> Result<BTreeMap<ShotId, Progress>, QueueError> {
+        let texts: Vec<_> =
+            frames.iter().map(|(_, _, record)| self.text(record)).collect::<Result<_, _>>()?;
+        self.write(|transaction| {
+            let mut table = transaction.open_table(FRAMES)?;
+            let mut shots = transaction.open_table(PROGRESS)?;
+            let mut far = BTreeMap::new();
+            for ((shot, index, record), text) in frames.iter().zip(&texts) {
+                let before = table.insert((shot.0, *index), text.as_slice())?.is_some();
+                let progress = match far.entry(*shot) {
+                    std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
+                    std::collections::btree_map::Entry::Vacant(new) => {
+                        let row = shots.get(shot.0)?.map(|row| row.value()).unwrap_or_default();
+                        new.insert(Progress::from_row(row))
+                    }
+                };
+                match record {
+                    _ if before => {}
+                    FrameRecord::Done { .. } => progress.done += 1,
+                    FrameRecord::Failed(_) => progress.failed += 1,
+                }
+                if matches!(record, FrameRecord::Done { .. }) {
+                    progress.last = Some(*index);
+                }
+            }
+            for (shot, progress) in &far {
+                shots.insert(shot.0, progress.row())?;
+            }
+            Ok(far)
+        })
+    }
+
+    /// Forgets that these frames were finished: their pictures are not what they were.
+    /// Returns how far the shot is now.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn unrecord(
+        &mut self,
+        shot: ShotId,
+        frames: &[FrameIndex],
+    ) -> Result<Progress, QueueError> {
+        self.write(|transaction| {
+            let mut table = transaction.open_table(FRAMES)?;
+            let mut shots = transaction.open_table(PROGRESS)?;
+            let row = shots.get(shot.0)?.map(|row| row.value()).unwrap_or_default();
+            let mut progress = Progress::from_row(row);
+            for &index in frames {
+                if table.remove((shot.0, index))?.is_some() {
+                    progress.done = progress.done.saturating_sub(1);
+                }
+            }
+            shots.insert(shot.0, progress.row())?;
+            Ok(progress)
+        })
+    }
+
+    /// What became of the frames of a shot, by index.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn frames(
+        &mut self,
+        shot: ShotId,
+    ) -> Result<BTreeMap<FrameIndex, FrameRecord>, QueueError> {
+        let rows = self.read(|transaction| {
+            let table = transaction.open_table(FRAMES)?;
+            let range = table.range((shot.0, 0)..=(shot.0, u32::MAX))?;
+            range
+                .map(|row| row.map(|(key, text)| (key.value().1, text.value().to_vec())))
+                .collect::<Result<Vec<_>, _>>()
+                .map_err(redb::Error::from)
+        })?;
+        let parsed = rows.into_iter().map(|(index, text)| {
+            Ok((index, self.parse(&format!("frame {index} of {shot}"), &text)?))
+        });
+        parsed.collect()
+    }
+
+    /// What became of one frame.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn frame(
+        &mut self,
+        shot: ShotId,
+        index: FrameIndex,
+    ) -> Result<Option<FrameRecord>, QueueError> {
+        let text = self.read(|transaction| {
+            let table = transaction.open_table(FRAMES)?;
+            Ok(table.get((shot.0, index))?.map(|text| text.value().to_vec()))
+        })?;
+        text.map(|text| self.parse(&format!("frame {index} of {shot}"), &text)).transpose()
+    }
+
+    /// The frames that are not over, each with its camera.
+    ///
+    /// # Errors
+    /// If they cannot be read; [`QueueError::Unfit`] if they are not those of the shot.
+    pub fn missing(
+        &mut self,
+        shot: ShotId,
+        record: &ShotRecord,
+    ) -> Result<Vec<(FrameIndex, Camera)>, QueueError> {
+        let [width, height] = record.plan.size;
+        let (over, pieces) = self.read(|transaction| {
+            let all = (shot.0, 0)..=(shot.0, u32::MAX);
+            let frames = transaction.open_table(FRAMES)?;
+            let over: Result<std::collections::BTreeSet<_>, _> =
+                frames.range(all.clone())?.map(|row| row.map(|(key, _)| key.value().1)).collect();
+            let cameras = transaction.open_table(CAMERAS)?;
+            let pieces: Result<Vec<_>, _> = cameras
+                .range(all)?
+                .map(|row| row.map(|(_, piece)| piece.value().to_vec()))
+                .collect();
+            Ok((over?, pieces?))
+        })?;
+        let cameras: Vec<_> =
+            pieces.iter().flat_map(|piece| unpack(piece, (width, height))).collect();
+        if cameras.len() != record.frames as usize || !cameras.iter().all(Camera::is_valid) {
+            let found = cameras.len();
+            return Err(QueueError::Unfit(format!(
+                "it has {} frames, and {found} cameras that can be read",
+                record.frames
+            )));
+        }
+        Ok((0..).zip(cameras).filter(|(index, _)| !over.contains(index)).collect())
+    }
+
+    /// Forgets shots that are over. Their files stay.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn forget(&mut self, shots: &[ShotId]) -> Result<(), QueueError> {
+        self.write(|transaction| {
+            let mut records = transaction.open_table(SHOTS)?;
+            let mut progress = transaction.open_table(PROGRESS)?;
+            let mut frames = transaction.open_table(FRAMES)?;
+            let mut cameras = transaction.open_table(CAMERAS)?;
+            for shot in shots {
+                records.remove(shot.0)?;
+                progress.remove(shot.0)?;
+                let all = (shot.0, 0)..=(shot.0, u32::MAX);
+                frames.retain_in(all.clone(), |_, _| false)?;
+                cameras.retain_in(all, |_, _| false)?;
+            }
+            Ok(())
+        })
+    }
+
+    fn write<T>(
+        &mut self,
+        work: impl FnOnce(&WriteTransaction) -> Result<T, redb::Error>,
+    ) -> Result<T, QueueError> {
+        let result = self.database().and_then(|database| {
+            let transaction = database.begin_write()?;
+            let value = work(&transaction)?;
+            transaction.commit()?;
+            Ok(value)
+        });
+        result.map_err(|why| self.failed(why))
+    }
+
+    fn read<T>(
+        &mut self,
+        work: impl FnOnce(&redb::ReadTransaction) -> Result<T, redb::Error>,
+    ) -> Result<T, QueueError> {
+        let result = self.database().and_then(|database| work(&database.begin_read()?));
+        result.map_err(|why| self.failed(why))
+    }
+
+    fn database(&mut self) -> Result<&Database, redb::Error> {
+        match &mut self.database {
+            Some(database) => Ok(database),
+            closed => Ok(closed.insert((self.opener)()?)),
+        }
+    }
+
+    /// The file cannot be trusted until it is opened again.
+    fn failed(&mut self, why: redb::Error) -> QueueError {
+        self.database = None;
+        match why {
+            redb::Error::Io(source) => {
+                let folder = self.path.parent().unwrap_or(Path::new("."));
+                match source.kind() {
+                    ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+                        super::disk::full(folder, 1)
+                    }
+                    _ => self.damaged(source.to_string()),
+                }
+            }
+            redb::Error::DatabaseAlreadyOpen => self.damaged("another program has it open".into()),
+            other => self.damaged(format!(
+                "{other}; move the file away to begin with an empty queue: pictures stay in \"shots\""
+            )),
+        }
+    }
+
+    fn damaged(&self, why: String) -> QueueError {
+        QueueError::Ledger { path: self.path.clone(), why }
+    }
+
+    fn text(&self, value: &impl Serialize) -> Result<Vec<u8>, QueueError> {
+        serde_json::to_vec(value).map_err(|why| self.damaged(format!("cannot be written: {why}")))
+    }
+
+    fn parse<T: for<'de> Deserialize<'de>>(
+        &self,
+        what: &str,
+        text: &[u8],
+    ) -> Result<T, QueueError> {
+        serde_json::from_slice(text)
+            .map_err(|why| self.damaged(format!("the record of {what} cannot be read: {why}")))
+    }
+}
+
+fn pack(cameras: &[Camera]) -> Vec<u8> {
+    let numbers = |camera: &Camera| {
+        let axes = [camera.position, camera.right, camera.up, camera.forward];
+        axes.into_iter().flat_map(|axis| axis.to_array()).chain([camera.tan_half_hfov])
+    };
+    cameras.iter().flat_map(|camera| numbers(camera).flat_map(f64::to_le_bytes)).collect()
+}
+
+fn unpack(piece: &[u8], (width, height): (u32, u32)) -> impl Iterator<Item = Camera> {
+    piece.chunks_exact(8 * CAMERA_NUMBERS).map(move |bytes| {
+        let mut numbers = [0.0; CAMERA_NUMBERS];
+        for (number, bytes) in numbers.iter_mut().zip(bytes.as_chunks::<8>().0) {
+            *number = f64::from_le_bytes(*bytes);
+        }
+        let axis = |at: usize| [numbers[at], numbers[at + 1], numbers[at + 2]].into();
+        let tan_half_hfov = numbers[12];
+        let (position, right, up, forward) = (axis(0), axis(3), axis(6), axis(9));
+        Camera { position, right, up, forward, tan_half_hfov, width, height }
+    })
+}

@@ -1,0 +1,182 @@
+//! The queue with a farm and workers inside the test: shots to their files, and every way
+//! of being cut off.
+#![allow(clippy::unwrap_used)]
+
+mod full;
+mod house;
+mod killed;
+mod rules;
+
+use super::*;
+use crate::sink::manifest::Manifest;
+use house::{House, Land, plan, until};
+use std::fs;
+use terrafarm_common::id::WorkerId;
+
+fn manifest(files: &ShotFiles) -> Manifest {
+    serde_json::from_slice(&fs::read(files.manifest()).unwrap()).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_shot_becomes_pictures_a_film_and_a_manifest() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    let _worker = house.hire(WorkerId(1)).await;
+    let mut plan = plan(&land, 7);
+    (plan.film, plan.first_frame) = (Some(Film::Mp4), 100);
+    let refused = house.queue.submit(plan.clone()).await.unwrap_err();
+    assert!(matches!(refused, QueueError::Missing(blobs) if blobs == [land.index]));
+    land.send(&house.queue).await;
+    let shot = house.queue.submit(plan).await.unwrap();
+    assert_eq!(shot, ShotId(1));
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    let view = house.queue.shot(shot).unwrap();
+    assert_eq!((view.frames_done, view.frames_failed, view.note.as_str()), (7, 0, ""));
+    let files = house.queue.files(shot).unwrap();
+    assert!((100..107).all(|number| files.frame(number).unwrap().is_file()));
+    assert_eq!((files.frame(99), files.frame(107)), (None, None));
+    assert!(files.film().metadata().unwrap().len() > 100);
+    let manifest = manifest(&files);
+    assert_eq!(manifest.frames.len(), 7);
+    assert_eq!(manifest.frames[6].index, 106);
+    assert_eq!(manifest.terrain_sha256, land.index.to_hex());
+    assert!(manifest.workers[0].jobs >= 7);
+    assert_eq!(house.queue.order(Order::Why(shot, 103)).await.unwrap(), "it is done");
+    assert!(matches!(
+        house.queue.order(Order::Why(shot, 99)).await,
+        Err(QueueError::NoFrame { first: 100, last: 106, .. })
+    ));
+    assert!(matches!(house.queue.order(Order::Pause(shot)).await, Err(QueueError::Over { .. })));
+    assert!(matches!(
+        house.queue.order(Order::Pause(ShotId(9))).await,
+        Err(QueueError::NoShot(ShotId(9)))
+    ));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn orders_take_effect_and_are_there_after_a_restart() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let mut shots = Vec::new();
+    for _ in 0..3 {
+        shots.push(house.queue.submit(plan(&land, 4)).await.unwrap());
+    }
+    until(&house.queue, |list| list.iter().all(|shot| shot.state == ShotState::Running)).await;
+    house.queue.order(Order::Pause(shots[0])).await.unwrap();
+    house.queue.order(Order::Cancel(shots[1])).await.unwrap();
+    house.queue.order(Order::Prioritise(shots[2], 5)).await.unwrap();
+    let why = house.queue.order(Order::Why(shots[0], 0)).await.unwrap();
+    assert_eq!(why, "its shot is paused");
+    for _ in 0..2 {
+        let list = house.queue.shots();
+        let states: Vec<_> = list.iter().map(|shot| shot.state).collect();
+        assert_eq!(states[..2], [ShotState::Paused, ShotState::Canceled]);
+        assert_eq!(list[2].priority, 5);
+        house = house.restart().await;
+    }
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[2].state == ShotState::Done).await;
+    assert_eq!(house.queue.shot(shots[0]).unwrap().frames_done, 0);
+    house.queue.order(Order::Resume(shots[0])).await.unwrap();
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    assert_eq!(house.queue.submit(plan(&land, 1)).await.unwrap(), ShotId(4), "no number twice");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let tile = land.blobs[1].0;
+    let name = tile.to_hex();
+    let shot = house.queue.submit(plan(&land, 3)).await.unwrap();
+    fs::write(folder.path().join("blobs").join(&name[..2]).join(&name), b"damaged").unwrap();
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Stalled).await;
+    assert!(house.queue.shot(shot).unwrap().note.contains(&name));
+    assert_eq!(house.queue.missing_blobs(vec![tile]).await.unwrap(), [tile]);
+    land.send(&house.queue).await;
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    assert_eq!(house.queue.shot(shot).unwrap().frames_failed, 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn damaged_pictures_are_rendered_again_before_the_film_is_made() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let mut plan = plan(&land, 4);
+    plan.film = Some(Film::Mp4);
+    let shot = house.queue.submit(plan).await.unwrap();
+    // One frame of four: the rest comes when the worker does.
+    let worker = house.hire_for(WorkerId(1), 1).await;
+    until(&house.queue, |list| list[0].frames_done == 1).await;
+    worker.abort();
+    let files = house.queue.files(shot).unwrap();
+    let done = house.queue.shot(shot).unwrap().last_frame.unwrap();
+    let path = files.frame(done).unwrap();
+    let mut bytes = fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x55;
+    fs::write(&path, bytes).unwrap();
+    let _worker = house.hire(WorkerId(2)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    let rendered = house.rendered();
+    assert_eq!(rendered.iter().filter(|&&frame| frame == done).count(), 2, "{rendered:?}");
+    assert_eq!(manifest(&files).frames.len(), 4);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn more_urgent_shots_come_first_and_few_are_in_the_farm() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    for _ in 0..40 {
+        house.queue.submit(plan(&land, 1)).await.unwrap();
+    }
+    let mut urgent = plan(&land, 1);
+    urgent.priority = 9;
+    let urgent = house.queue.submit(urgent).await.unwrap();
+    let running =
+        |list: &ShotList| list.iter().filter(|shot| shot.state == ShotState::Running).count();
+    // The fifth is displaced, and keeps what it has begun.
+    until(&house.queue, |list| list[40].state == ShotState::Running && running(list) == 6).await;
+    assert_eq!(house.queue.shot(ShotId(6)).unwrap().state, ShotState::Waiting);
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list.iter().all(|shot| shot.state == ShotState::Done)).await;
+    assert_eq!(house.shots_rendered()[0], urgent);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_second_coordinator_is_told_who_holds_the_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let house = House::open(folder.path()).await;
+    let refused = Queue::open(house::config(folder.path()), house.line.clone()).await;
+    let why = refused.err().unwrap().to_string();
+    assert!(why.contains(&format!("process {}", std::process::id())), "{why}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_nobody_needs_goes_beyond_its_limit() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut config = house::config(folder.path());
+    (config.terrain_cache_bytes, config.terrain_grace) = (0, Duration::ZERO);
+    let house = House::with(config).await;
+    land.send(&house.queue).await;
+    house.queue.submit(plan(&land, 2)).await.unwrap();
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    let all: Vec<_> = land.blobs.iter().map(|(hash, _)| *hash).collect();
+    let deadline = std::time::Instant::now() + house::PATIENCE;
+    while house.queue.missing_blobs(all.clone()).await.unwrap().len() < all.len() {
+        assert!(std::time::Instant::now() < deadline, "terrain stays");
+        tokio::task::yield_now().await;
+    }
+}

@@ -1,0 +1,522 @@
+//! The coordinator's API by real HTTP and over the link of the farm: what it answers, whom
+//! it lets in, and how soon.
+
+use crate::support::{Dir, Running, World, frame_hashes, run, succeed, terrafarm, worker};
+use glam::DVec3;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+use terrafarm_common::accuracy::Share;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::quality::{Method, Quality};
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_coordinator::ask::Line;
+use terrafarm_coordinator::queue::{ShotPlan, Source};
+use terrafarm_terrain::store::StoreReader;
+use terrafarm_wire::link::Trust;
+use terrafarm_wire::message::Verb;
+use terrafarm_worker::sleeper::Sleeper;
+use tokio_util::sync::CancellationToken;
+
+const SIZE: [&str; 4] = ["--size", "192x108", "--fps", "4"];
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A coordinator with a queue and a page.
+pub struct Office {
+    pub running: Running,
+    /// Where workers and commands connect.
+    pub address: String,
+    /// Where HTTP is.
+    pub http: String,
+}
+
+/// Starts one with its queue in this folder.
+pub fn office(dir: &Dir, more: &[&str]) -> Office {
+    let mut running = Running::start(
+        terrafarm()
+            .args(["-v", "coordinator", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"])
+            .arg("--data")
+            .arg(dir.path("queue"))
+            .args(more),
+    );
+    let address = running.expect("coordinator on ").rsplit(' ').next().unwrap().to_owned();
+    let line = running.expect("look at it:");
+    let http = line.split("http://").nth(1).unwrap().split('/').next().unwrap().to_owned();
+    Office { running, address, http }
+}
+
+impl Office {
+    /// A command that asks this coordinator.
+    pub fn ask(&self, words: &[&str]) -> Command {
+        let mut command = terrafarm();
+        command.args(words).args(["--coordinator", &self.address]);
+        command
+    }
+
+    /// Submits a world's flight; returns the number of the shot.
+    pub fn submit(&self, world: &World, more: &[&str]) -> u64 {
+        let mut submit = self.ask(&["submit"]);
+        submit.arg(&world.scene).arg("--flight").arg(&world.flight).args(SIZE).args(more);
+        succeed(&mut submit).trim().parse().unwrap()
+    }
+
+    pub fn get(&self, path: &str) -> Reply {
+        http(&self.http, "GET", path, &[], b"")
+    }
+
+    pub fn json(&self, path: &str) -> serde_json::Value {
+        let reply = self.get(path);
+        assert_eq!(reply.status, 200, "{path}: {}", reply.text());
+        reply.json()
+    }
+
+    /// Asks again and again until something holds of an answer.
+    pub fn wait(
+        &self,
+        path: &str,
+        holds: impl Fn(&serde_json::Value) -> bool,
+    ) -> serde_json::Value {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let answer = self.json(path);
+            if holds(&answer) {
+                return answer;
+            }
+            assert!(Instant::now() < deadline, "{path} stays {answer}");
+            std::thread::yield_now();
+        }
+    }
+}
+
+/// An answer by HTTP.
+pub struct Reply {
+    pub status: u16,
+    pub head: String,
+    pub body: Vec<u8>,
+}
+
+impl Reply {
+    pub fn text(&self) -> String {
+        String::from_utf8_lossy(&self.body).into_owned()
+    }
+
+    pub fn json(&self) -> serde_json::Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|_| panic!("no JSON: {}", self.text()))
+    }
+
+    pub fn header(&self, name: &str) -> Option<&str> {
+        let lines = self.head.lines().filter_map(|line| line.split_once(": "));
+        lines.into_iter().find(|(key, _)| key.eq_ignore_ascii_case(name)).map(|(_, value)| value)
+    }
+}
+
+/// One request over a connection of its own. `more` may replace the `Host`.
+pub fn http(address: &str, method: &str, path: &str, more: &[(&str, &str)], body: &[u8]) -> Reply {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let mut request = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
+    if !more.iter().any(|(name, _)| *name == "Host") {
+        request += &format!("Host: {address}\r\n");
+    }
+    for (name, value) in more {
+        request += &format!("{name}: {value}\r\n");
+    }
+    if !body.is_empty() {
+        request += &format!("Content-Length: {}\r\n", body.len());
+    }
+    stream.write_all(format!("{request}\r\n").as_bytes()).unwrap();
+    // It may refuse before everything is written.
+    let _ = stream.write_all(body);
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    let end = answer.windows(4).position(|four| four == b"\r\n\r\n").expect("an answer") + 4;
+    let head = String::from_utf8_lossy(&answer[..end]).into_owned();
+    let status = head.split(' ').nth(1).and_then(|word| word.parse().ok()).expect("a status");
+    let mut body = answer.split_off(end);
+    if head.to_lowercase().contains("transfer-encoding: chunked") {
+        body = unchunk(&body);
+    }
+    Reply { status, head, body }
+}
+
+fn unchunk(mut bytes: &[u8]) -> Vec<u8> {
+    let mut whole = Vec::new();
+    while let Some(end) = bytes.windows(2).position(|two| two == b"\r\n") {
+        let length =
+            usize::from_str_radix(std::str::from_utf8(&bytes[..end]).unwrap(), 16).unwrap();
+        if length == 0 {
+            break;
+        }
+        whole.extend_from_slice(&bytes[end + 2..end + 2 + length]);
+        bytes = &bytes[end + 2 + length + 2..];
+    }
+    whole
+}
+
+#[test]
+fn a_submitted_shot_is_rendered_without_its_submitter_and_fetched_as_a_local_render_makes_it() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let shot = office.submit(&world, &["--film", "mp4", "--name", "valley"]);
+    let _worker = worker(&office.address, "one");
+    let path = format!("/api/v1/shots/{shot}");
+    let done = office.wait(&path, |shot| shot["state"] == "done");
+    assert_eq!((done["name"].as_str(), done["frames_done"].as_u64()), (Some("valley"), Some(9)));
+    let calm = world.dir.path("calm");
+    succeed(world.render().args(SIZE).args(["--workers", "1", "-o"]).arg(&calm));
+    let fetched = world.dir.path("fetched");
+    let number = shot.to_string();
+    let fetch = || {
+        let mut command = office.ask(&["fetch", &number]);
+        command.arg("-o").arg(&fetched);
+        command
+    };
+    succeed(&mut fetch());
+    let hashes = |folder: &Path| frame_hashes(&folder.join("manifest.json"));
+    assert_eq!(hashes(&fetched), hashes(&calm));
+    // One picture is damaged, one is half there: both are made whole.
+    std::fs::write(fetched.join("frame_00003.png"), b"nothing").unwrap();
+    let whole = std::fs::read(fetched.join("frame_00005.png")).unwrap();
+    std::fs::remove_file(fetched.join("frame_00005.png")).unwrap();
+    std::fs::write(fetched.join("frame_00005.png.part"), &whole[..whole.len() / 2]).unwrap();
+    succeed(&mut fetch());
+    assert_eq!(std::fs::read(fetched.join("frame_00005.png")).unwrap(), whole);
+    succeed(terrafarm().arg("compare").arg(&fetched).arg(&calm));
+    // By HTTP, the same bytes; by range, a part of them.
+    let frame = office.get(&format!("{path}/frames/5.png"));
+    assert_eq!((frame.status, frame.header("content-type")), (200, Some("image/png")));
+    assert_eq!(frame.body, whole);
+    let part = http(
+        &office.http,
+        "GET",
+        &format!("{path}/frames/5.png"),
+        &[("Range", "bytes=10-19")],
+        b"",
+    );
+    assert_eq!((part.status, &part.body[..]), (206, &whole[10..20]));
+    assert_eq!(part.header("content-range").unwrap(), format!("bytes 10-19/{}", whole.len()));
+    let film = world.dir.path("film.mp4");
+    succeed(office.ask(&["fetch", &number]).arg("-o").arg(&film));
+    assert_eq!(std::fs::read(&film).unwrap(), office.get(&format!("{path}/film.mp4")).body);
+    let last = office.get(&format!("{path}/last.jpg"));
+    assert_eq!((last.status, last.header("content-type")), (200, Some("image/jpeg")));
+    assert_eq!(last.body[..2], [0xff, 0xd8]);
+}
+
+#[test]
+fn orders_by_http_and_by_command_take_effect_and_say_so() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let shot = office.submit(&world, &["--name", "orders"]);
+    let path = format!("/api/v1/shots/{shot}");
+    let post = |what: &str| http(&office.http, "POST", &format!("{path}/{what}"), &[], b"");
+    assert_eq!(post("pause").status, 200);
+    assert_eq!(office.json(&path)["state"], "paused");
+    let why = office.json(&format!("{path}/frames/3/why"));
+    assert!(why["why"].as_str().unwrap().contains("paused"), "{why}");
+    let number = shot.to_string();
+    let said = succeed(&mut office.ask(&["why", &number, "3"]));
+    assert!(said.contains("frame 3: ") && said.contains("paused"), "{said}");
+    succeed(&mut office.ask(&["resume", &number]));
+    assert_ne!(office.json(&path)["state"], "paused");
+    succeed(&mut office.ask(&["priority", &number, "-7"]));
+    assert_eq!(office.json(&path)["priority"], -7);
+    let body = br#"{"priority": 12}"#;
+    assert_eq!(http(&office.http, "PUT", &format!("{path}/priority"), &[], body).status, 200);
+    let listed = succeed(&mut office.ask(&["shots", "--json"]));
+    let listed: serde_json::Value = serde_json::from_str(&listed).unwrap();
+    assert_eq!(listed["shots"][0]["priority"], 12);
+    succeed(&mut office.ask(&["cancel", &number]));
+    assert_eq!(office.json(&path)["state"], "canceled");
+    assert_eq!(post("resume").status, 409, "it is over");
+    let over = office.json("/api/v1/shots?state=over");
+    assert_eq!((over["total"].as_u64(), over["shots"][0]["id"].as_u64()), (Some(1), Some(shot)));
+    assert_eq!(office.json("/api/v1/shots?state=active")["total"], 0);
+}
+
+#[test]
+fn a_worker_is_listed_by_name_and_leaves_when_it_is_told_to() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let leaving = worker(&office.address, "leaving");
+    let one = office.wait("/api/v1/workers", |list| list["total"] == 1);
+    let one = &one["workers"][0];
+    assert_eq!((one["name"].as_str(), one["state"].as_str()), (Some("leaving"), Some("idle")));
+    assert!(succeed(&mut office.ask(&["workers"])).contains("leaving"));
+    let (_, said) = run(&mut office.ask(&["drain", "nobody"]), 2);
+    assert!(said.contains("no worker is called nobody"), "{said}");
+    assert!(succeed(&mut office.ask(&["clear", "leaving"])).contains("blocked for no shot"));
+    succeed(&mut office.ask(&["drain", "leaving"]));
+    let (code, lines) = leaving.finish();
+    assert_eq!(code, Some(0), "{lines:#?}");
+    office.wait("/api/v1/workers", |list| list["total"] == 0);
+}
+
+#[test]
+fn what_cannot_be_answered_is_refused_as_json_with_the_right_status() {
+    let dir = Dir::new();
+    let office = office(&dir, &[]);
+    let long = format!("/api/v1/shots/{}", "9".repeat(30));
+    let large = vec![b' '; 1 << 20];
+    let hash = "0".repeat(64);
+    let blob = format!("/api/v1/blobs/{hash}");
+    let cases: &[(&str, &str, &[u8], u16)] = &[
+        ("GET", "/nothing", b"", 404),
+        ("GET", "/api/v1/shots/17", b"", 404),
+        ("GET", "/api/v1/shots/x", b"", 400),
+        ("GET", &long, b"", 400),
+        ("GET", "/api/v1/shots/17/frames/0.png", b"", 404),
+        ("GET", "/api/v1/shots/17/frames/..%2f..%2fqueue.redb", b"", 404),
+        ("GET", "/api/v1/shots/17/last.jpg", b"", 404),
+        ("GET", "/api/v1/shots?state=asleep", b"", 400),
+        ("GET", "/api/v1/shots?offset=-1", b"", 400),
+        ("GET", "/api/v1/events?shots_state=asleep", b"", 400),
+        ("POST", "/api/v1/shots/17/pause", b"", 404),
+        ("DELETE", "/api/v1/shots/17", b"", 405),
+        ("GET", "/api/v1/shots/17/pause", b"", 405),
+        ("PUT", "/api/v1/shots/17/priority", b"{}", 400),
+        ("PUT", "/api/v1/shots/17/priority", br#"{"priority": 99999999999}"#, 400),
+        ("PUT", "/api/v1/shots/17/priority", &large, 413),
+        ("POST", "/api/v1/workers/17/drain", b"", 404),
+        ("POST", "/api/v1/shots", b"{", 400),
+        ("POST", "/api/v1/shots", br#"{"name": "x"}"#, 400),
+        ("POST", "/api/v1/blobs/missing", b"[1]", 400),
+        ("POST", "/api/v1/blobs/missing", br#"["00"]"#, 400),
+        ("PUT", "/api/v1/blobs/00", b"x", 400),
+        ("PUT", &blob, b"something else", 400),
+    ];
+    for (method, path, body, status) in cases {
+        let reply = http(&office.http, method, path, &[], body);
+        assert_eq!(reply.status, *status, "{method} {path}: {}", reply.text());
+        assert_eq!(reply.header("content-type"), Some("application/json"), "{method} {path}");
+        let error = reply.json()["error"].as_str().unwrap_or_default().to_owned();
+        assert!(!error.is_empty() && !error.contains('\n'), "{method} {path}: {error:?}");
+        assert_eq!(reply.header("x-content-type-options"), Some("nosniff"));
+    }
+    let health = office.get("/healthz");
+    assert_eq!((health.status, health.json()["status"].as_str()), (200, Some("serving")));
+    let metrics = office.get("/metrics").text();
+    for line in metrics.lines().filter(|line| !line.starts_with('#')) {
+        let (name, value) = line.rsplit_once(' ').unwrap();
+        assert!(name.starts_with("terrafarm_") && value.parse::<f64>().is_ok(), "{line}");
+    }
+    assert!(metrics.contains("terrafarm_shots{state=\"waiting\"} 0"), "{metrics}");
+}
+
+#[test]
+fn a_coordinator_without_a_queue_says_how_to_get_one() {
+    let world = World::new(300);
+    let (_running, address) = crate::support::coordinator();
+    let mut submit = terrafarm();
+    submit.arg("submit").arg(&world.scene).arg("--flight").arg(&world.flight);
+    let (_, said) = run(submit.args(["--coordinator", &address]), 2);
+    assert!(said.contains("--data"), "{said}");
+    assert!(succeed(terrafarm().args(["shots", "--coordinator", &address])).contains("no shots"));
+}
+
+#[test]
+fn strange_pages_in_a_browser_are_refused() {
+    let dir = Dir::new();
+    let office = office(&dir, &[]);
+    let status = |method: &str, more: &[(&str, &str)]| {
+        http(&office.http, method, "/api/v1/farm", more, b"").status
+    };
+    assert_eq!(status("GET", &[("Host", "rebound.example:7879")]), 421);
+    assert_eq!(status("GET", &[("Host", "localhost:7879")]), 200);
+    let pause = |more: &[(&str, &str)]| {
+        http(&office.http, "POST", "/api/v1/shots/1/pause", more, b"").status
+    };
+    let own = format!("http://{}", office.http);
+    assert_eq!(pause(&[("Origin", "https://evil.example")]), 403);
+    assert_eq!(pause(&[("Origin", "null")]), 403);
+    assert_eq!(pause(&[("Sec-Fetch-Site", "cross-site")]), 403);
+    assert_eq!(pause(&[("Origin", &own), ("Sec-Fetch-Site", "same-origin")]), 404, "no such shot");
+    let reply = office.get("/");
+    assert!(reply.header("content-security-policy").unwrap().contains("script-src 'self'"));
+    assert!(reply.header("access-control-allow-origin").is_none());
+    assert!(!reply.text().contains("<script>") && !reply.text().contains("http://"));
+}
+
+#[test]
+fn where_a_key_is_asked_for_nothing_is_told_without_it() {
+    let dir = Dir::new();
+    let token_file = dir.path("farm.token");
+    let token_file = token_file.to_str().unwrap();
+    let office = office(&dir, &["--http-key", "--token-file", token_file]);
+    let key = succeed(terrafarm().args(["token", "--web", "--token-file", token_file]));
+    let key = key.trim();
+    let token = std::fs::read_to_string(token_file).unwrap();
+    assert!(key.len() == 32 && !token.to_lowercase().contains(&key[..8]));
+    let get = |path: &str, more: &[(&str, &str)]| http(&office.http, "GET", path, more, b"");
+    for path in ["/api/v1/farm", "/api/v1/events", "/metrics", "/page.js", "/nothing"] {
+        let reply = get(path, &[]);
+        assert_eq!(reply.status, 401, "{path}");
+        assert!(reply.json()["error"].as_str().unwrap().contains("terrafarm token --web"));
+    }
+    let sent_on = get("/", &[]);
+    assert_eq!((sent_on.status, sent_on.header("location")), (303, Some("/login")));
+    assert!(get("/login", &[]).text().contains("<form"));
+    assert_eq!(get("/healthz", &[]).status, 200);
+    let bearer = format!("Bearer {key}");
+    assert_eq!(get("/metrics", &[("Authorization", &bearer)]).status, 200);
+    let since = Instant::now();
+    assert_eq!(get("/api/v1/farm", &[("Authorization", "Bearer 00")]).status, 401);
+    assert!(since.elapsed() >= Duration::from_secs(1), "a wrong key costs a second");
+    let login =
+        |key: &str| http(&office.http, "POST", "/login", &[], format!("key={key}").as_bytes());
+    assert!(login("00").header("set-cookie").is_none());
+    let entered = login(&format!("+{}", key.to_uppercase()));
+    let cookie = entered.header("set-cookie").unwrap();
+    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    let cookie = cookie.split(';').next().unwrap();
+    assert_eq!(get("/api/v1/farm", &[("Cookie", cookie)]).status, 200);
+    // Whoever holds the token needs no key: the link of the farm is another door.
+    let mut shots = office.ask(&["shots", "--token-file", token_file]);
+    assert!(succeed(&mut shots).contains("no shots"));
+}
+
+#[test]
+fn a_port_that_was_asked_for_and_is_taken_is_an_error() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    let mut second = terrafarm();
+    second.args(["coordinator", "--listen", "127.0.0.1:0", "--http", &address]);
+    let (_, said) = run(&mut second, 2);
+    assert!(said.contains("cannot serve the page"), "{said}");
+}
+
+#[test]
+fn floods_of_silent_and_slow_connections_keep_nobody_out() {
+    let dir = Dir::new();
+    let office = office(&dir, &[]);
+    // More than may be silent, and more than may be served.
+    let silent: Vec<_> = (0..700).map(|_| TcpStream::connect(&office.http).unwrap()).collect();
+    let mut slow: Vec<_> = (0..100).map(|_| TcpStream::connect(&office.http).unwrap()).collect();
+    for stream in &mut slow {
+        // Those that gave way cannot be written to.
+        let _ = stream.write_all(b"GET / HTTP/1.1\r\nHost: 127.0");
+    }
+    let since = Instant::now();
+    assert_eq!(office.get("/healthz").status, 200);
+    assert!(since.elapsed() < Duration::from_secs(2), "answered after {:?}", since.elapsed());
+    drop((silent, slow));
+    let long = "x".repeat(40 << 10);
+    assert_eq!(http(&office.http, "GET", "/", &[("X-Long", &long)], b"").status, 431);
+}
+
+/// A stream of events: what it says first, and when.
+pub fn first_events(address: &str, query: &str) -> (Vec<(String, serde_json::Value)>, TcpStream) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "GET /api/v1/events?{query} HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+    let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
+    let (mut events, mut name) = (Vec::new(), String::new());
+    while events.len() < 3 {
+        let line = lines.next().expect("the stream goes on").unwrap();
+        if let Some(text) = line.strip_prefix("event: ") {
+            name = text.to_owned();
+        } else if let Some(text) = line.strip_prefix("data: ") {
+            events.push((name.clone(), serde_json::from_str(text).unwrap()));
+        }
+        assert!(!line.starts_with("HTTP/1.1 5"), "{line}");
+    }
+    (events, stream)
+}
+
+#[test]
+fn streams_of_events_are_bounded_and_tell_the_part_of_the_lists_that_is_asked_for() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    for name in ["one", "two", "three"] {
+        office.submit(&world, &["--name", name]);
+    }
+    let (events, first) = first_events(&office.http, "shots_limit=1&shots_offset=1");
+    let names: Vec<_> = events.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(names, ["farm", "shots", "workers"]);
+    let shots = &events[1].1;
+    assert_eq!(
+        (shots["total"].as_u64(), shots["shots"][0]["name"].as_str()),
+        (Some(3), Some("two"))
+    );
+    let more: Vec<_> = (1..64).map(|_| first_events(&office.http, "").1).collect();
+    assert_eq!(office.get("/api/v1/events").status, 503);
+    drop((first, more));
+}
+
+/// A shot of one small frame over a store that the coordinator has.
+fn tiny(store: &StoreReader, number: u32) -> ShotPlan {
+    let size = (64, 36);
+    let camera = Camera::from_angles(DVec3::new(900.0, 900.0, 2000.0), 0.0, -20.0, 0.0, 60.0, size);
+    ShotPlan {
+        name: format!("shot number {number}"),
+        priority: 0,
+        index: store.index_blob().0,
+        shading: Shading {
+            sun: None,
+            haze: None,
+            sky: Sky::default(),
+            earth: None,
+            below_ground: [0.0; 3],
+            bare_ground: None,
+        },
+        quality: Quality { method: Method::Auto, samples_per_side: 1, tolerance_px: 1.0 },
+        check: Share::NONE,
+        size: [size.0, size.1],
+        split: Split::Columns,
+        fps: 25.0,
+        first_frame: 0,
+        cameras: vec![camera],
+        frames_in_flight: 3,
+        film: None,
+        source: Source::default(),
+    }
+}
+
+/// Fills an office: so many shots, so many workers that sleep over their first job.
+pub async fn crowd(office: &Office, world: &World, shots: u32, workers: u64) -> CancellationToken {
+    let first = office.submit(world, &["--name", "first"]);
+    let cancel = format!("/api/v1/shots/{first}/cancel");
+    assert_eq!(http(&office.http, "POST", &cancel, &[], b"").status, 200);
+    let store = StoreReader::open(&world.dir.path("land.terrain")).unwrap();
+    let mut line = Line::open(&office.address, &Trust::Loopback).await.unwrap();
+    for number in 0..shots {
+        let body = serde_json::to_vec(&tiny(&store, number)).unwrap();
+        line.ask(Verb::Post, "/api/v1/shots", None, body.into()).await.unwrap();
+    }
+    let stop = CancellationToken::new();
+    for number in 1..=workers {
+        let name = format!("sleeper-{number}");
+        let job = Duration::from_secs(3600);
+        let sleeper = Sleeper::connect(&office.address, &name, number, job).await.unwrap();
+        tokio::spawn(sleeper.work(stop.clone()));
+    }
+    stop
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_10_000_shots_and_1000_workers_the_page_is_there_within_200_ms() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let stop = crowd(&office, &world, 10_000, 1000).await;
+    office.wait("/api/v1/farm", |farm| farm["workers"]["connected"] == 1000);
+    let mut times = Vec::new();
+    for _ in 0..5 {
+        let since = Instant::now();
+        assert_eq!(office.get("/").status, 200);
+        for file in ["/page.css", "/page.js", "/chart.js", "/api/v1/farm"] {
+            assert_eq!(office.get(file).status, 200);
+        }
+        let query = "shots_state=active&shots_limit=20&workers_limit=50";
+        let (events, _stream) = first_events(&office.http, query);
+        times.push(since.elapsed());
+        assert!(events[1].1["total"].as_u64().unwrap() >= 10_000, "{}", events[1].1["total"]);
+        assert_eq!(events[2].1["total"], 1000);
+    }
+    times.sort();
+    println!("the page and its first events: {times:?}");
+    assert!(times[2] < Duration::from_millis(200), "{times:?}");
+    stop.cancel();
+}
