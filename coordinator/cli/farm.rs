@@ -8,6 +8,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
+use terrafarm_coordinator::client::Coordinator;
 use terrafarm_coordinator::{Config, CoordinatorError};
 use terrafarm_wire::link::{FarmToken, Trust};
 use tokio::net::TcpListener;
@@ -23,14 +24,14 @@ const RESTART_PAUSE: Duration = Duration::from_millis(200);
 
 /// Where the local farm listens, and the means to end it.
 pub struct LocalFarm {
-    /// Address of its coordinator.
-    pub address: SocketAddr,
+    /// Its coordinator, as a client on this PC sees it.
+    pub coordinator: Coordinator,
     /// Cancelled when the last worker has ended for good: nobody is left to render.
     pub deserted: CancellationToken,
     stop_workers: CancellationToken,
     stop_coordinator: CancellationToken,
     workers: JoinSet<anyhow::Result<()>>,
-    coordinator: JoinHandle<Result<(), CoordinatorError>>,
+    serving: JoinHandle<Result<(), CoordinatorError>>,
 }
 
 /// How many workers of how many threads.
@@ -99,9 +100,10 @@ impl LocalFarm {
         let deserted = CancellationToken::new();
         // The last clone to be dropped is that of the last worker.
         let leaving = Arc::new(deserted.clone().drop_guard());
+        let seen = Coordinator { trust: trust.clone(), ..Coordinator::local(address) };
         let config = Config { name: "local".into(), trust, ..Config::default() };
         let until = stop_coordinator.clone().cancelled_owned();
-        let coordinator = tokio::spawn(terrafarm_coordinator::run(config, listener, until));
+        let serving = tokio::spawn(terrafarm_coordinator::run(config, listener, until));
         let mut crew = JoinSet::new();
         for number in 1..=workers {
             let until = stop_workers.clone();
@@ -116,8 +118,8 @@ impl LocalFarm {
                 ended
             });
         }
-        let workers = crew;
-        Ok(LocalFarm { address, deserted, stop_workers, stop_coordinator, workers, coordinator })
+        let (coordinator, workers) = (seen, crew);
+        Ok(LocalFarm { coordinator, deserted, stop_workers, stop_coordinator, workers, serving })
     }
 
     /// Ends workers and coordinator, and waits for them.
@@ -126,7 +128,7 @@ impl LocalFarm {
         self.stop_workers.cancel();
         while self.workers.join_next().await.is_some() {}
         self.stop_coordinator.cancel();
-        let _ = self.coordinator.await;
+        let _ = self.serving.await;
     }
 }
 

@@ -209,7 +209,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
             let (address, trust) = (address.clone(), trust.clone());
             Coordinator { address, trust, patience: COORDINATOR_PATIENCE }
         }
-        (Farm::Local(_), Some(farm)) => Coordinator::local(farm.address),
+        (Farm::Local(_), Some(farm)) => farm.coordinator.clone(),
         (Farm::Local(_), None) => unreachable!("a local farm was started above"),
     };
     let stop = CancellationToken::new();

@@ -259,13 +259,12 @@ async fn fly(
         Some(links) => behind(links, crew).await?,
         None => LocalFarm::start(crew).await?,
     };
-    let address = farm.address.to_string();
     let began = Instant::now();
     loop {
         let eye = DVec3::new(0.0, 0.0, YARD_HEIGHT_M);
         let tiny = Camera::from_angles(eye, 45.0, -30.0, 0.0, 60.0, (64, 64));
         let shot = submission(yard, vec![tiny; 2], Split::Tiles(8));
-        let (done, _) = render(&address, shot).await?;
+        let (done, _) = render(&farm.coordinator, shot).await?;
         if done.workers.len() as u32 >= crew.workers {
             break;
         }
@@ -274,7 +273,7 @@ async fn fly(
     let before = links.as_ref().map(Links::carried).transpose()?;
     let (cpu, all_cpu) = (process::own_cpu_s(), process::all_cpu_s());
     let shot = submission(store, cameras.to_vec(), Split::Columns);
-    let (done, frames) = render(&address, shot).await?;
+    let (done, frames) = render(&farm.coordinator, shot).await?;
     let cpu_s = cpu.zip(process::own_cpu_s()).map(|(before, after)| after - before);
     let all_cpu_s = all_cpu.zip(process::all_cpu_s()).map(|(before, after)| after - before);
     let after = links.as_ref().map(Links::carried).transpose()?;
@@ -314,7 +313,7 @@ async fn behind(links: &Links, crew: Crew) -> anyhow::Result<LocalFarm> {
 
 /// Renders a shot into memory.
 async fn render(
-    address: &str,
+    coordinator: &Coordinator,
     shot: Submission,
 ) -> anyhow::Result<(ShotDone, BTreeMap<FrameIndex, Rgb8>)> {
     let (updates, mut inbox) = mpsc::channel(16);
@@ -337,8 +336,8 @@ async fn render(
         }
         frames
     });
-    let (coordinator, stop) = (Coordinator::local(address), CancellationToken::new());
-    let done = client::render(&coordinator, shot, updates, taken_out, stop).await?;
+    let stop = CancellationToken::new();
+    let done = client::render(coordinator, shot, updates, taken_out, stop).await?;
     Ok((done, keeping.await.context("the frames were not kept")?))
 }
 
