@@ -424,20 +424,22 @@ impl Ledger {
     fn failed(&mut self, why: redb::Error) -> QueueError {
         self.database = None;
         match why {
-            redb::Error::Io(source) => {
-                let folder = self.path.parent().unwrap_or(Path::new("."));
-                match source.kind() {
-                    ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
-                        super::disk::full(folder, 1)
-                    }
-                    _ => self.damaged(source.to_string()),
+            redb::Error::Io(source) => match source.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+                    super::disk::full(self.path.parent().unwrap_or(Path::new(".")), 1)
                 }
-            }
+                ErrorKind::InvalidData | ErrorKind::UnexpectedEof => self.unreadable(&source),
+                _ => self.damaged(source.to_string()),
+            },
             redb::Error::DatabaseAlreadyOpen => self.damaged("another program has it open".into()),
-            other => self.damaged(format!(
-                "{other}; move the file away to begin with an empty queue: pictures stay in \"shots\""
-            )),
+            other => self.unreadable(&other),
         }
+    }
+
+    fn unreadable(&self, why: &dyn std::fmt::Display) -> QueueError {
+        self.damaged(format!(
+            "{why}; move the file away to begin with an empty queue: pictures stay in \"shots\""
+        ))
     }
 
     fn damaged(&self, why: String) -> QueueError {
