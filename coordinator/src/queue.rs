@@ -175,6 +175,9 @@ pub enum QueueError {
     /// The farm refused.
     #[error(transparent)]
     Order(#[from] OrderError),
+    /// A mistake of this program.
+    #[error("a part of the queue failed; the coordinator's log says where")]
+    Broken,
     /// The coordinator is stopping.
     #[error("the coordinator stops")]
     Stopping,
@@ -372,7 +375,11 @@ impl Queue {
 async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, QueueError> + Send + 'static,
 ) -> Result<T, QueueError> {
-    tokio::task::spawn_blocking(work).await.map_err(|_| QueueError::Stopping)?
+    let broken = |why: tokio::task::JoinError| match why.is_panic() {
+        true => QueueError::Broken,
+        false => QueueError::Stopping,
+    };
+    tokio::task::spawn_blocking(work).await.map_err(broken)?
 }
 
 #[cfg(test)]

@@ -110,7 +110,9 @@ fn a_coordinator_that_is_killed_again_and_again_finishes_what_was_submitted() {
 fn a_second_coordinator_with_the_same_folder_is_told_who_has_it() {
     let dir = Dir::new();
     let data = dir.path("data");
-    let (_first, _) = coordinator(&data, "127.0.0.1:0");
+    let (_first, address) = coordinator(&data, "127.0.0.1:0");
+    // Its answer says that it has the folder.
+    succeed(terrafarm().args(["shots", "--coordinator", &address]));
     let mut second = terrafarm();
     second.args(["coordinator", "--no-http", "--listen", "127.0.0.1:0", "--data"]).arg(&data);
     let (_, said) = run(&mut second, 2);

@@ -93,9 +93,10 @@ impl From<QueueError> for Refusal {
             QueueError::Over { .. } => StatusCode::CONFLICT,
             QueueError::Full | QueueError::DiskFull { .. } => StatusCode::INSUFFICIENT_STORAGE,
             QueueError::Stopping => StatusCode::SERVICE_UNAVAILABLE,
-            QueueError::Locked { .. } | QueueError::Io { .. } | QueueError::Ledger { .. } => {
-                StatusCode::INTERNAL_SERVER_ERROR
-            }
+            QueueError::Broken
+            | QueueError::Locked { .. }
+            | QueueError::Io { .. }
+            | QueueError::Ledger { .. } => StatusCode::INTERNAL_SERVER_ERROR,
         };
         Refusal::new(status, text)
     }

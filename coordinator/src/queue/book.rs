@@ -31,6 +31,8 @@ pub struct Book {
     /// Shots whose manifest or film is missing.
     finishing: BTreeSet<ShotId>,
     present: BTreeSet<ShotId>,
+    /// Shots that lack terrain.
+    lacking: BTreeSet<ShotId>,
     active: usize,
 }
 
@@ -82,6 +84,7 @@ impl Book {
             over: BTreeSet::new(),
             finishing: BTreeSet::new(),
             present: BTreeSet::new(),
+            lacking: BTreeSet::new(),
             active: active.max(1),
         };
         for shot in saved {
@@ -122,6 +125,7 @@ impl Book {
     pub fn forget(&mut self, id: ShotId) {
         self.unfile(id);
         self.over.remove(&id);
+        self.lacking.remove(&id);
         self.shots.remove(&id);
     }
 
@@ -186,9 +190,19 @@ impl Book {
 
     /// Terrain of a shot is missing, or is there again.
     pub fn set_lacks(&mut self, id: ShotId, lacks: Option<BlobHash>) {
-        if let Some(shot) = self.shots.get_mut(&id) {
-            shot.lacks = lacks;
+        let Some(shot) = self.shots.get_mut(&id) else { return };
+        shot.lacks = lacks;
+        if lacks.is_some() {
+            self.lacking.insert(id);
+        } else {
+            self.lacking.remove(&id);
         }
+    }
+
+    /// The shots that lack this blob.
+    pub fn lacking(&self, hash: BlobHash) -> Vec<ShotId> {
+        let lacks = |id: &ShotId| self.shots.get(id).is_some_and(|shot| shot.lacks == Some(hash));
+        self.lacking.iter().copied().filter(lacks).collect()
     }
 
     /// The farm has not taken a shot.

@@ -19,6 +19,7 @@ use redb::{Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTran
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{FrameIndex, ShotId};
@@ -396,48 +397,69 @@ impl Ledger {
         &mut self,
         work: impl FnOnce(&WriteTransaction) -> Result<T, redb::Error>,
     ) -> Result<T, QueueError> {
-        let result = self.database().and_then(|database| {
+        self.with_database(|database| {
             let transaction = database.begin_write()?;
             let value = work(&transaction)?;
             transaction.commit()?;
             Ok(value)
-        });
-        result.map_err(|why| self.failed(why))
+        })
     }
 
     fn read<T>(
         &mut self,
         work: impl FnOnce(&redb::ReadTransaction) -> Result<T, redb::Error>,
     ) -> Result<T, QueueError> {
-        let result = self.database().and_then(|database| work(&database.begin_read()?));
-        result.map_err(|why| self.failed(why))
+        self.with_database(|database| work(&database.begin_read()?))
     }
 
-    fn database(&mut self) -> Result<&Database, redb::Error> {
-        match &mut self.database {
-            Some(database) => Ok(database),
-            closed => Ok(closed.insert((self.opener)()?)),
+    /// Opens the file if need be. redb gives up by a panic where a file contradicts itself:
+    /// that is an error of the file here.
+    fn with_database<T>(
+        &mut self,
+        work: impl FnOnce(&Database) -> Result<T, redb::Error>,
+    ) -> Result<T, QueueError> {
+        let worked = catch_unwind(AssertUnwindSafe(|| match &mut self.database {
+            Some(database) => work(database),
+            closed => work(closed.insert((self.opener)()?)),
+        }));
+        match worked {
+            Ok(Ok(value)) => Ok(value),
+            Ok(Err(why)) => Err(self.failed(why)),
+            Err(_) => {
+                self.close();
+                Err(self.unreadable(&"its pages contradict each other"))
+            }
+        }
+    }
+
+    fn close(&mut self) {
+        let database = self.database.take();
+        // Closing writes, too.
+        if catch_unwind(AssertUnwindSafe(|| drop(database))).is_err() {
+            tracing::warn!(path = %self.path.display(), "the records could not be closed in order");
         }
     }
 
     /// The file cannot be trusted until it is opened again.
     fn failed(&mut self, why: redb::Error) -> QueueError {
-        self.database = None;
+        self.close();
         match why {
-            redb::Error::Io(source) => {
-                let folder = self.path.parent().unwrap_or(Path::new("."));
-                match source.kind() {
-                    ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
-                        super::disk::full(folder, 1)
-                    }
-                    _ => self.damaged(source.to_string()),
+            redb::Error::Io(source) => match source.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+                    super::disk::full(self.path.parent().unwrap_or(Path::new(".")), 1)
                 }
-            }
+                ErrorKind::InvalidData | ErrorKind::UnexpectedEof => self.unreadable(&source),
+                _ => self.damaged(source.to_string()),
+            },
             redb::Error::DatabaseAlreadyOpen => self.damaged("another program has it open".into()),
-            other => self.damaged(format!(
-                "{other}; move the file away to begin with an empty queue: pictures stay in \"shots\""
-            )),
+            other => self.unreadable(&other),
         }
+    }
+
+    fn unreadable(&self, why: &dyn std::fmt::Display) -> QueueError {
+        self.damaged(format!(
+            "{why}; move the file away to begin with an empty queue: pictures stay in \"shots\""
+        ))
     }
 
     fn damaged(&self, why: String) -> QueueError {

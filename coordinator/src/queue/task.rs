@@ -244,9 +244,7 @@ impl Task {
                 let _ = answer.send(carried_out);
             }
             Command::Came(hash) => {
-                let lacking = |(_, shot): &(ShotId, &super::book::Shot)| shot.lacks == Some(hash);
-                let shots: Vec<_> = self.book.iter().filter(lacking).map(|(id, _)| id).collect();
-                for shot in shots {
+                for shot in self.book.lacking(hash) {
                     self.book.set_lacks(shot, None);
                     self.changed.insert(shot);
                     self.sync_pause(shot).await;

@@ -180,3 +180,47 @@ async fn terrain_that_nobody_needs_goes_beyond_its_limit() {
         tokio::task::yield_now().await;
     }
 }
+
+/// Not a check but a measurement: `cargo test queue::tests::speed -- --ignored --nocapture`.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "a measurement"]
+async fn speed_and_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    for (frames, in_flight) in [(300, 3), (1000, 16), (2000, 64)] {
+        let mut plan = plan(&land, frames);
+        plan.frames_in_flight = in_flight;
+        let at = house.queue.shots().len();
+        house.queue.submit(plan).await.unwrap();
+        let worker = house.hire(WorkerId(1 + u64::from(frames))).await;
+        let since = std::time::Instant::now();
+        until(&house.queue, |list| list[at].state == ShotState::Done).await;
+        let rate = f64::from(frames) / since.elapsed().as_secs_f64();
+        println!("{frames} frames of 32 x 16 pixels, {in_flight} in flight: {rate:.0} frames/s");
+        worker.abort();
+    }
+    let before = resident_bytes();
+    let since = std::time::Instant::now();
+    for _ in 0..10_000 {
+        house.queue.submit(plan(&land, 100)).await.unwrap();
+    }
+    let took = since.elapsed().as_secs_f64();
+    let grown = (resident_bytes() - before) >> 10;
+    println!("10000 shots of 100 frames: {took:.1} s, {grown} KiB more memory");
+    let since = std::time::Instant::now();
+    house.queue.order(Order::Pause(ShotId(9000))).await.unwrap();
+    println!("an order among them: {:.1} ms", 1e3 * since.elapsed().as_secs_f64());
+    let config = house.cut_off();
+    let since = std::time::Instant::now();
+    let house = House::with(config).await;
+    let took = since.elapsed().as_secs_f64();
+    println!("opened again: {} shots, {took:.2} s", house.queue.shots().len());
+}
+
+/// Memory of this process, bytes; 0 where nobody says.
+fn resident_bytes() -> i64 {
+    let text = fs::read_to_string("/proc/self/statm").unwrap_or_default();
+    text.split(' ').nth(1).and_then(|pages| pages.parse::<i64>().ok()).unwrap_or(0) * 4096
+}

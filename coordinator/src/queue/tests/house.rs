@@ -125,10 +125,12 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
     while let Some(message) = end.recv().await {
         match message {
             Message::OpenShot(open) => {
-                if index_of.insert(open.shot, open.index).is_none_or(|old| old != open.index) {
-                    wanted.push(open.index);
-                    line.work(worker, WantBlobs { hashes: vec![open.index] }).await;
+                let is_known = index_of.insert(open.shot, open.index) == Some(open.index);
+                if is_known {
+                    continue;
                 }
+                wanted.push(open.index);
+                line.work(worker, WantBlobs { hashes: vec![open.index] }).await;
             }
             Message::Blob(blob) => {
                 wanted.retain(|hash| *hash != blob.hash);
