@@ -7,6 +7,7 @@
 //! maxima are exact always; quantiles are those of the kept values.
 
 use crate::stats::quantile;
+use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
 /// Errors above this are not told apart, pixels: 64 stands for 64 and more.
@@ -187,7 +188,8 @@ fn spread(values: impl Iterator<Item = f64>, max: f64) -> Option<Spread> {
 }
 
 /// What share of the pixels of a picture is measured, in millionths.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(try_from = "u32", into = "u32")]
 pub struct Share(u32);
 
 impl Share {
@@ -210,6 +212,20 @@ impl Share {
     /// pixels of a share are among those of every larger one.
     pub fn takes(self, number: u32) -> bool {
         (u64::from(number) * u64::from(Self::WHOLE)) >> 32 < u64::from(self.0)
+    }
+}
+
+impl TryFrom<u32> for Share {
+    type Error = &'static str;
+
+    fn try_from(millionths: u32) -> Result<Self, Self::Error> {
+        Share::from_millionths(millionths).ok_or("a share is at most one")
+    }
+}
+
+impl From<Share> for u32 {
+    fn from(share: Share) -> u32 {
+        share.0
     }
 }
 

@@ -9,6 +9,10 @@ use std::path::PathBuf;
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
+use terrafarm_worker::office::hours::Hours;
+
+/// Where a coordinator listens, and is looked for, unless something else is said.
+pub const COORDINATOR: &str = "127.0.0.1:7070";
 
 /// Flies a camera over real terrain, rendered by every PC in the office.
 #[derive(Debug, Parser)]
@@ -342,8 +346,11 @@ pub enum Encoder {
 #[derive(Debug, ClapArgs)]
 pub struct Coordinator {
     /// Address to listen on
-    #[arg(long, default_value = "127.0.0.1:7070")]
+    #[arg(long, default_value = COORDINATOR)]
     pub listen: SocketAddr,
+    /// Do not let workers on the local network find this coordinator (multicast DNS)
+    #[arg(long)]
+    pub no_announce: bool,
     /// How links are secured
     #[command(flatten)]
     pub security: Security,
@@ -365,14 +372,10 @@ pub struct Coordinator {
 /// `terrafarm worker`
 #[derive(Debug, ClapArgs)]
 pub struct Worker {
-    /// The coordinator to work for
-    #[arg(
-        long,
-        value_name = "HOST:PORT",
-        env = "TERRAFARM_COORDINATOR",
-        default_value = "127.0.0.1:7070"
-    )]
-    pub coordinator: String,
+    /// The coordinator to work for [default: the one on this PC, else the one that answers
+    /// on this network]
+    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
+    pub coordinator: Option<String>,
     /// How the link is secured
     #[command(flatten)]
     pub security: Security,
@@ -391,6 +394,17 @@ pub struct Worker {
     /// Memory for decoded tiles, MiB
     #[arg(long, default_value_t = 1024, value_parser = clap::value_parser!(u64).range(64..=1_048_576))]
     pub memory_limit: u64,
+    /// When to work, by this PC's clock: days, times or both, such as
+    /// "mon-fri 18:00-08:00, sat, sun" [default: always]
+    #[arg(long, value_name = "HOURS", env = "TERRAFARM_HOURS")]
+    pub hours: Option<Hours>,
+    /// Make room: one thread while the PC's user is there, none on cores that other
+    /// programs use
+    #[arg(long)]
+    pub polite: bool,
+    /// Most to send and most to receive, megabits per second each [default: no limit]
+    #[arg(long, value_name = "MBIT", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub bandwidth: Option<u64>,
     /// End when the coordinator goes away instead of waiting for it
     #[arg(long)]
     pub once: bool,
@@ -415,20 +429,57 @@ pub struct Compare {
 #[derive(Debug, ClapArgs)]
 pub struct Simulate {
     /// Workers
-    #[arg(long, default_value_t = 31, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, default_value_t = 31, value_parser = parse_simulated_workers)]
     pub workers: u32,
-    /// Frames of the shot [default: about a minute of work]
+    /// Frames of all shots together [default: about a minute of work]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
+    /// Shots that share the frames, of three priorities; all but the first arrive within the
+    /// first half minute
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub shots: u32,
     /// Same seed, same run
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Let workers die, fall silent, come back late and lose messages
+    /// Everything below goes wrong, and workers hang, get stuck, fail at jobs and hand them
+    /// back
     #[arg(long)]
     pub faults: bool,
+    /// Workers leave, crash or lose power, and come back, all the time
+    #[arg(long)]
+    pub churn: bool,
+    /// Links and whole switches carry nothing for a while; what workers render meanwhile
+    /// comes too late
+    #[arg(long)]
+    pub partitions: bool,
+    /// A third of the links are wireless, or come from homes
+    #[arg(long)]
+    pub slow_links: bool,
+    /// Messages are lost, or come twice
+    #[arg(long)]
+    pub lost_messages: bool,
+    /// Some columns cost sixteen times as much as others, and some frames ten times
+    #[arg(long)]
+    pub skew: bool,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Keep a journal of all that the scheduler is told, to be replayed
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
+    /// Instead of making a night up, play a journal again; exit code 1 if the scheduler does
+    /// not ask for the same
+    #[arg(long, value_name = "FILE", conflicts_with_all = [
+        "workers", "frames", "shots", "seed", "faults", "churn", "partitions", "slow_links",
+        "lost_messages", "skew", "journal",
+    ])]
+    pub replay: Option<PathBuf>,
+}
+
+fn parse_simulated_workers(text: &str) -> Result<u32, String> {
+    let most = terrafarm_sched::MAX_WORKERS as u32;
+    let workers = text.parse().ok().filter(|workers| (1..=most).contains(workers));
+    workers.ok_or_else(|| format!("choose 1 to {most}: a farm has no room for more"))
 }
 
 /// `terrafarm bench ...`

@@ -10,6 +10,7 @@ mod args;
 mod commands;
 mod farm;
 mod input;
+mod lan;
 mod notify;
 mod place;
 mod progress;

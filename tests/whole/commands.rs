@@ -258,7 +258,40 @@ fn the_simulator_keeps_its_promises_for_a_few_seeds() {
             .filter(|(_, n)| n.as_u64() != Some(0))
             .collect();
         assert!(broken.is_empty(), "seed {seed}: {broken:?}");
+        for key in ["efficiency", "makespan_s", "jobs"] {
+            assert!(report[key].as_f64().is_some_and(|value| value > 0.0), "{key}");
+        }
     }
+}
+
+#[test]
+fn a_simulated_night_replays_from_its_journal_and_a_damaged_one_is_refused() {
+    let dir = Dir::new();
+    let journal = dir.path("night");
+    let faults = ["--churn", "--partitions", "--slow-links", "--lost-messages", "--skew"];
+    succeed(
+        terrafarm()
+            .args(["simulate", "--frames", "60", "--shots", "3"])
+            .args(faults)
+            .arg("--journal")
+            .arg(&journal),
+    );
+    let replay = |file: &Path| {
+        let output = terrafarm().args(["simulate", "--replay"]).arg(file).output().unwrap();
+        let words = [output.stdout, output.stderr].concat();
+        (output.status.code(), String::from_utf8(words).unwrap())
+    };
+    let (code, words) = replay(&journal);
+    assert!(code == Some(0) && words.contains("the same"), "{words}");
+    let whole = fs::read(&journal).unwrap();
+    fs::write(&journal, &whole[..whole.len() / 2 + 1]).unwrap();
+    let (code, words) = replay(&journal);
+    assert!(code == Some(0) && words.contains("cut off"), "{words}");
+    let mut damaged = whole;
+    damaged[500] ^= 1;
+    fs::write(&journal, &damaged).unwrap();
+    let (code, words) = replay(&journal);
+    assert!(code == Some(2) && words.contains("damaged at byte"), "{words}");
 }
 
 /// Heights of `gdallocationinfo` at lon/lat points, bilinear between samples.

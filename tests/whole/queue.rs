@@ -1,7 +1,9 @@
 //! The queue on disk outlives its coordinator, killed at any moment; workers find the next
 //! one by themselves, and nothing finished is rendered again.
 
-use crate::support::{Dir, PATIENCE, Running, World, frame_hashes, run, succeed, terrafarm, worker};
+use crate::support::{
+    Dir, PATIENCE, Running, World, frame_hashes, run, succeed, terrafarm, worker,
+};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;

@@ -3,7 +3,8 @@
 //! [`run`] is the whole of it. Read in this order: [`session`] decides what to do about
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
-//! the session asks for over one connection; `backoff` says when to try again, `clock` where the
+//! the session asks for over one connection; [`office`] says when and with how many threads
+//! a worker on somebody's PC works; `backoff` says when to try again, `clock` where the
 //! time goes, `trial` how fast this PC is. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
@@ -14,6 +15,7 @@
 
 mod backoff;
 mod clock;
+pub mod office;
 pub mod render;
 pub mod session;
 mod shift;
@@ -25,6 +27,7 @@ pub use backoff::Reconnect;
 pub use render::{Caster, RayCaster};
 
 use backoff::Backoff;
+use office::{Gate, Rules, Watch};
 use shift::{Shift, Site};
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -32,7 +35,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use terrafarm_terrain::cache::BlobCache;
-use terrafarm_wire::link::{Connection, HandshakeError, Trust, greet, is_this_pc};
+use terrafarm_wire::link::{Connection, HandshakeError, Paced, Trust, greet, is_this_pc};
 use terrafarm_wire::message::{Hello, Role, Welcome};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -61,6 +64,11 @@ pub struct WorkerConfig {
     /// Memory for decoded terrain, bytes. A height tile takes 0.4 MB, a photo tile 0.5 MB;
     /// a job whose own tiles take more fails.
     pub memory_limit_bytes: u64,
+    /// When to work, and whether to make room for others on this PC.
+    pub rules: Rules,
+    /// Most that is sent and most that is received, bytes per second each; no limit if
+    /// `None`.
+    pub bandwidth_bytes_per_s: Option<u64>,
     /// What to do when there is no connection.
     pub reconnect: Reconnect,
     /// A number of this process: the worker's incarnation and the seed of its back-off.
@@ -149,8 +157,13 @@ async fn work<C: Caster>(
 ) -> Result<Ended, WorkerError> {
     let mut site = site(&config, caster).await?;
     let mut backoff = Backoff::new(config.reconnect, config.seed);
+    let mut watch = Watch::begin(&config.rules, config.threads, &site.gate);
     let mut welcomed = false;
     loop {
+        tokio::select! {
+            () = watch.on_duty() => {}
+            () = stop.cancelled() => return Ok(Ended::Stopped),
+        }
         let why = match connect(&config, &stop).await {
             Ok(None) => return Ok(Ended::Stopped),
             Ok(Some((connection, welcome, peer))) => {
@@ -158,8 +171,13 @@ async fn work<C: Caster>(
                 backoff.reset();
                 welcomed = true;
                 let shift = Shift::new(&mut site, !is_this_pc(peer.ip()), &welcome);
-                match shift.work(connection, &stop).await {
+                let leave = stop.child_token();
+                match watch.over(shift.work(connection, &leave), &leave).await {
                     Ok(()) if stop.is_cancelled() => return Ok(Ended::Stopped),
+                    Ok(()) if leave.is_cancelled() => {
+                        info!("off duty: this worker's hours are over");
+                        continue;
+                    }
                     Ok(()) => return Ok(Ended::Drained),
                     Err(lost) => lost.to_string(),
                 }
@@ -226,10 +244,11 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     });
     let pixels_per_s = trial.await.ok().flatten();
     debug!(pixels_per_s, "tried how fast this worker is");
-    Ok(Site { pool, cache, terrain, caster, pixels_per_s })
+    let gate = Gate::new(threads);
+    Ok(Site { pool, cache, terrain, caster, gate, pixels_per_s })
 }
 
-type Connected = (Connection<TcpStream>, Welcome, SocketAddr);
+type Connected = (Connection<Paced<TcpStream>>, Welcome, SocketAddr);
 
 /// A greeted connection; `None` if the worker is told to stop meanwhile.
 async fn connect(
@@ -249,6 +268,7 @@ async fn connect(
         let role = Role::Worker { threads, incarnation: config.seed };
         let hello = Hello::new(&config.name, role);
         let token = config.trust.token_for(peer.ip())?;
+        let stream = Paced::new(stream, config.bandwidth_bytes_per_s);
         let (connection, welcome) = greet(stream, token, hello, CONNECT_LIMIT).await?;
         Ok((connection, welcome, peer))
     };

@@ -6,12 +6,12 @@
 //! time of one piece a core. A panic of the ray caster ends the job, not the worker.
 
 use crate::clock::CoreClock;
-use rayon::prelude::*;
+use crate::office::Gate;
 use std::any::Any;
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::{PixelError, Share, Summary, pixel_number};
 use terrafarm_common::id::{FrameIndex, LeaseId};
@@ -221,15 +221,16 @@ impl<C: Caster> Job<C> {
         }
     }
 
-    /// Renders what can be rendered, on the thread pool it is called on. Gives the reason
-    /// if the ray caster panics.
+    /// Renders what can be rendered, on the thread pool it is called on, by as many threads
+    /// as the gate lets. Gives the reason if the ray caster panics.
     pub fn advance(
         mut self: Box<Self>,
         caster: &C,
         scene: &Scene<C::Prepared>,
+        gate: &Gate,
     ) -> Result<Outcome<C>, String> {
         let began = Instant::now();
-        let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene)));
+        let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene, gate)));
         self.spent += began.elapsed();
         let missing = missing
             .map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?
@@ -248,28 +249,27 @@ impl<C: Caster> Job<C> {
         &mut self,
         caster: &C,
         scene: &Scene<C::Prepared>,
+        gate: &Gate,
     ) -> Result<BTreeSet<TileKey>, Unfit> {
         let (view, stop, frame) = (&self.view, &self.stop, self.check.frame);
         let coreless = &self.coreless;
-        let open = self.pieces.par_iter_mut().with_max_len(1).filter(|piece| !piece.is_done());
-        let advanced = open.map(|piece| {
+        let missing = Mutex::new(Ok(BTreeSet::new()));
+        let open = self.pieces.iter_mut().filter(|piece| !piece.is_done());
+        share_out(open, gate, |piece| {
             if stop.load(Ordering::Relaxed) {
-                return Ok(BTreeSet::new());
+                return;
             }
-            let _counted = CoreClock::start(coreless);
-            if !piece.rendered {
-                let missing = caster.advance(scene, view, &mut piece.progress)?;
-                piece.rendered = missing.is_empty();
-                if !piece.rendered {
-                    return Ok(missing.into_iter().collect());
-                }
+            let counted = CoreClock::start(coreless);
+            let more = piece.advance(caster, scene, view, frame);
+            drop(counted);
+            let mut missing = missing.lock().unwrap_or_else(PoisonError::into_inner);
+            match (&mut *missing, more) {
+                (Ok(all), Ok(more)) => all.extend(more),
+                (Ok(_), Err(unfit)) => *missing = Err(unfit),
+                (Err(_), _) => {}
             }
-            piece.measure(caster, scene, view, frame)
         });
-        advanced.try_reduce(BTreeSet::new, |mut all, more: BTreeSet<_>| {
-            all.extend(more);
-            Ok(all)
-        })
+        missing.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn assemble(self, caster: &C) -> Result<Picture, String> {
@@ -299,6 +299,36 @@ impl<C: Caster> Job<C> {
     }
 }
 
+/// Has the threads of the pool that it is called on take items until there are none, never
+/// more threads at once than the gate lets. One that is too many leaves after the item in its hand;
+/// the gate lets at least one, so that the items always come to an end.
+fn share_out<T: Send>(items: impl Iterator<Item = T> + Send, gate: &Gate, work: impl Fn(T) + Sync) {
+    let items = Mutex::new(items);
+    let at_work = AtomicUsize::new(0);
+    let step = |change: fn(usize, usize) -> Option<usize>| {
+        let changed = at_work.try_update(Ordering::Relaxed, Ordering::Relaxed, |count| {
+            change(count, gate.threads())
+        });
+        changed.is_ok()
+    };
+    let turn = |_: &rayon::Scope<'_>| {
+        if !step(|count, most| (count < most).then_some(count + 1)) {
+            return;
+        }
+        while !step(|count, most| (count > most).then(|| count - 1)) {
+            let item = items.lock().unwrap_or_else(PoisonError::into_inner).next();
+            let Some(item) = item else { return };
+            work(item);
+        }
+    };
+    rayon::scope(|scope| {
+        for _ in 1..rayon::current_num_threads() {
+            scope.spawn(turn);
+        }
+        turn(scope);
+    });
+}
+
 impl Check {
     /// The pixels of a region that are measured.
     fn pixels(self, region: Region) -> Vec<[u32; 2]> {
@@ -314,6 +344,24 @@ impl Check {
 impl<C: Caster> Piece<C> {
     fn is_done(&self) -> bool {
         self.rendered && self.unmeasured.is_empty()
+    }
+
+    /// Does what can be done; the tiles that the rest waits for.
+    fn advance(
+        &mut self,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+        view: &View,
+        frame: FrameIndex,
+    ) -> Result<BTreeSet<TileKey>, Unfit> {
+        if !self.rendered {
+            let missing = caster.advance(scene, view, &mut self.progress)?;
+            self.rendered = missing.is_empty();
+            if !self.rendered {
+                return Ok(missing.into_iter().collect());
+            }
+        }
+        self.measure(caster, scene, view, frame)
     }
 
     /// Measures what can be measured; the tiles that the rest waits for.
@@ -349,4 +397,71 @@ impl<C: Caster> Piece<C> {
 pub(crate) fn said(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no reason given")
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+    use proptest::prelude::*;
+
+    fn pool(threads: usize) -> rayon::ThreadPool {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap()
+    }
+
+    /// Shares numbers out and returns those that came, and how many were in hand at once.
+    fn shared(
+        threads: usize,
+        gate: &Gate,
+        count: u32,
+        at: impl Fn(u32) + Sync,
+    ) -> (Vec<u32>, usize) {
+        let (seen, in_hand, most) =
+            (Mutex::new(Vec::new()), AtomicUsize::new(0), AtomicUsize::new(0));
+        pool(threads).install(|| {
+            share_out(0..count, gate, |number| {
+                most.fetch_max(in_hand.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+                at(number);
+                seen.lock().unwrap().push(number);
+                in_hand.fetch_sub(1, Ordering::SeqCst);
+            });
+        });
+        let mut seen = seen.into_inner().unwrap();
+        seen.sort_unstable();
+        (seen, most.into_inner())
+    }
+
+    #[test]
+    fn threads_that_are_too_many_leave_after_the_item_in_their_hand() {
+        let gate = Gate::new(4);
+        let closed = AtomicBool::new(false);
+        let after: [AtomicUsize; 4] = std::array::from_fn(|_| AtomicUsize::new(0));
+        let (seen, _) = shared(4, &gate, 2000, |number| {
+            if closed.load(Ordering::SeqCst) {
+                after[rayon::current_thread_index().unwrap()].fetch_add(1, Ordering::SeqCst);
+            }
+            if number == 100 {
+                gate.set(1);
+                closed.store(true, Ordering::SeqCst);
+            }
+        });
+        assert_eq!(seen, (0..2000).collect::<Vec<_>>());
+        // A thread may just have looked at the gate: then it takes one more.
+        let stayed = after.iter().filter(|count| count.load(Ordering::SeqCst) > 1).count();
+        assert_eq!(stayed, 1);
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+
+        #[test]
+        fn every_item_is_done_once_by_no_more_threads_than_the_gate_lets(
+            threads in 1usize..6, gate in 1usize..8, count in 0u32..200,
+        ) {
+            let (seen, most) = shared(threads, &Gate::new(gate), count, |_| {});
+            prop_assert_eq!(seen, (0..count).collect::<Vec<_>>());
+            prop_assert!(most <= gate.min(threads));
+        }
+    }
 }

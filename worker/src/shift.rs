@@ -6,6 +6,7 @@
 //! once whatever else goes on.
 
 use crate::clock::{TaskClock, Worked};
+use crate::office::Gate;
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
 use crate::session::{Action, Doing, Event, Session};
 use crate::terrain::Terrain;
@@ -47,6 +48,7 @@ pub(crate) struct Site<C: Caster> {
     pub cache: Option<Arc<BlobCache>>,
     pub terrain: Terrain<C::Prepared>,
     pub caster: Arc<C>,
+    pub gate: Gate,
     /// What a trial said of its speed.
     pub pixels_per_s: Option<u64>,
 }
@@ -302,9 +304,10 @@ impl<'a, C: Caster> Shift<'a, C> {
             return Some(Event::Broken(lease, "its terrain is not in memory".to_owned()));
         };
         let (caster, compress) = (self.site.caster.clone(), self.compress);
+        let gate = self.site.gate.clone();
         self.spawn(
             move || {
-                let outcome = job(&caster).advance(&*caster, &scene);
+                let outcome = job(&caster).advance(&*caster, &scene, &gate);
                 // The tiles are free to change before anyone hears of the outcome.
                 drop(scene);
                 match outcome {

@@ -13,12 +13,14 @@
 mod channel;
 pub mod handshake;
 pub mod outbox;
+mod pace;
 mod token;
 mod trust;
 
 pub use channel::ChannelError;
 pub use handshake::{Greeting, HandshakeError, accept, greet, program};
 pub use outbox::{Outbox, OutboxEnd, Unsent, outbox};
+pub use pace::Paced;
 pub use token::{FarmToken, NoRandomness, TOKEN_BYTES, TokenError};
 pub use trust::{Trust, is_this_pc};
 

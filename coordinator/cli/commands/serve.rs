@@ -1,20 +1,23 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
 use crate::secret::{self, Source};
-use crate::{Outcome, args, notify};
+use crate::{Outcome, args, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
 use terrafarm_coordinator::api::{Access, Web, WebKey};
 use terrafarm_coordinator::queue::QueueConfig;
 use terrafarm_wire::link::{Trust, is_this_pc};
+use terrafarm_worker::office::Rules;
 use terrafarm_worker::{Reconnect, WorkerConfig};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 
 const MIB: u64 = 1 << 20;
+/// How long the network is listened to before this PC is looked at again.
+const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7879);
 
@@ -31,6 +34,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         let address = listener.local_addr().context("cannot read the address listened on")?;
         let web = listen_http(&args.web, &trust).await?;
         announce(address, &trust, source.as_ref());
+        let _announced = announce_on_lan(args, address);
         if let Some(web) = &web {
             say_where(web)?;
         }
@@ -46,6 +50,20 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
         Ok(Outcome::Done)
     })
+}
+
+/// Lets workers on the local network find this coordinator.
+fn announce_on_lan(args: &args::Coordinator, address: SocketAddr) -> Option<lan::Announcement> {
+    if args.no_announce || is_this_pc(address.ip()) {
+        return None;
+    }
+    match lan::Announcement::begin(address, &pc_name()) {
+        Ok(announced) => Some(announced),
+        Err(why) => {
+            tracing::warn!("workers cannot find this coordinator by themselves: {why:#}");
+            None
+        }
+    }
 }
 
 /// The socket of the page, and who may use it. A port that is taken is an error only if it
@@ -147,24 +165,58 @@ fn quoted(path: &str) -> String {
 /// Works until Ctrl-C or SIGTERM, or with `--once` until the coordinator goes away.
 pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
-    let config = WorkerConfig {
+    let mut config = WorkerConfig {
         trust: secret::to_connect(&args.security)?,
-        coordinator: args.coordinator,
+        coordinator: args.coordinator.clone().unwrap_or_default(),
         name: args.name.unwrap_or_else(pc_name),
         threads: args.threads.unwrap_or(cores) as usize,
         cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
+        rules: Rules { hours: args.hours, polite: args.polite },
+        bandwidth_bytes_per_s: args.bandwidth.map(|megabits| megabits * 1_000_000 / 8),
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
         seed: process_seed(),
     };
     runtime()?.block_on(async {
         let stop = stop_signal();
+        let mut stop = std::pin::pin!(told(stop));
         // A coordinator that is not there yet is waited for, so the service is up already.
+        if args.coordinator.is_none() {
+            notify::ready("looking for a coordinator");
+            config.coordinator = tokio::select! {
+                found = whom_to_work_for(args.once) => found?,
+                () = &mut stop => return Ok(Outcome::Done),
+            };
+        }
         notify::ready(&format!("working for {}", config.coordinator));
-        terrafarm_worker::run(config, told(stop)).await?;
+        terrafarm_worker::run(config, stop).await?;
         Ok(Outcome::Done)
     })
+}
+
+/// The coordinator on this PC, or the one on this network.
+async fn whom_to_work_for(only_once: bool) -> anyhow::Result<String> {
+    let mut told = false;
+    loop {
+        if TcpStream::connect(args::COORDINATOR).await.is_ok() {
+            return Ok(args::COORDINATOR.to_owned());
+        }
+        let looking = tokio::task::spawn_blocking(|| lan::find(SEARCH));
+        if let Some(address) = looking.await.context("looking for a coordinator failed")?? {
+            println!("found a coordinator at {address}");
+            return Ok(address.to_string());
+        }
+        if only_once {
+            bail!(
+                "no coordinator on this PC, and none answers on this network; name one with \
+                 --coordinator HOST:PORT"
+            );
+        }
+        if !std::mem::replace(&mut told, true) {
+            println!("waiting for a coordinator; name one with --coordinator HOST:PORT");
+        }
+    }
 }
 
 /// The async runtime of a service: its threads move bytes, they never render.

@@ -1,24 +1,45 @@
-//! How many jobs a second go through the scheduler alone: 1000 workers that answer at
-//! once. `cargo run --release -p terrafarm-sched --example throughput`
+//! How many jobs a second go through the scheduler alone: 1000 workers, or as many as are
+//! asked for, that answer at once; with `journal`, while a journal of it is written.
+//! `cargo run --release -p terrafarm-sched --example throughput [WORKERS] [journal]`
 
 use std::collections::VecDeque;
 use std::time::Instant;
 use terrafarm_common::id::{ShotId, WorkerId};
 use terrafarm_common::region::Split;
+use terrafarm_sched::journal::{JOURNAL_BYTES, Recorder};
 use terrafarm_sched::{Action, Config, Event, Micros, Scheduler};
 
 const WORKERS: u64 = 1000;
+const SEED: u64 = 1;
 const FRAMES: u32 = 5_000;
 /// Time of a job, microseconds: long enough that every job is one strip of columns.
 const JOB_US: u64 = 200_000;
 
 fn main() {
-    let mut scheduler = Scheduler::new(Config::default(), 1);
-    for worker in 1..=WORKERS {
-        scheduler.handle(Micros(0), Event::WorkerJoined { worker: WorkerId(worker), threads: 1 });
+    let mut words = std::env::args().skip(1).peekable();
+    let workers = words.next_if(|word| word != "journal");
+    let workers = workers.map_or(WORKERS, |word| word.parse().expect("a number of workers"));
+    let mut journal = words.next().map(|_| {
+        Recorder::begin(std::io::sink(), &Config::default(), SEED, JOURNAL_BYTES)
+            .expect("nothing is written")
+    });
+    let mut scheduler = Scheduler::new(Config::default(), SEED);
+    let mut events = 0u64;
+    let mut tell = |scheduler: &mut Scheduler, now, event| {
+        events += 1;
+        match &mut journal {
+            Some(journal) => journal.handle(scheduler, Micros(now), event).expect("it has room"),
+            None => scheduler.handle(Micros(now), event),
+        }
+    };
+    for worker in 1..=workers {
+        let joined = Event::WorkerJoined { worker: WorkerId(worker), threads: 1 };
+        tell(&mut scheduler, 0, joined);
     }
-    scheduler.handle(
-        Micros(0),
+    let began = Instant::now();
+    tell(
+        &mut scheduler,
+        0,
         Event::ShotSubmitted {
             shot: ShotId(1),
             frames: FRAMES,
@@ -26,12 +47,12 @@ fn main() {
             height: 1080,
             split: Split::Columns,
             priority: 0,
-            frames_in_flight: 32,
+            // Twice 240 strips for every 240 workers, and some.
+            frames_in_flight: 32.max((workers / 100) as u32),
         },
     );
     let mut answers = VecDeque::new();
     let mut now = 0;
-    let began = Instant::now();
     loop {
         let mut is_over = false;
         let mut taken = Vec::new();
@@ -47,16 +68,18 @@ fn main() {
             }
         }
         for (shot, frame) in taken {
-            scheduler.handle(Micros(now), Event::FrameTaken { shot, frame });
+            tell(&mut scheduler, now, Event::FrameTaken { shot, frame });
         }
         if is_over {
             break;
         }
         let Some((at, worker, lease)) = answers.pop_front() else { continue };
         now = at.max(now);
-        scheduler.handle(Micros(now), Event::JobDone { worker, lease, cost_us: JOB_US, digest: 0 });
+        tell(&mut scheduler, now, Event::JobDone { worker, lease, cost_us: JOB_US, digest: 0 });
     }
     let jobs = scheduler.account().accepted;
     let seconds = began.elapsed().as_secs_f64();
-    println!("{jobs} jobs in {seconds:.2} s: {:.0} jobs/s", jobs as f64 / seconds);
+    let (job_rate, event_rate) = (jobs as f64 / seconds, events as f64 / seconds);
+    println!("{workers} workers: {jobs} jobs in {seconds:.2} s");
+    println!("{job_rate:.0} jobs/s, {event_rate:.0} events/s");
 }

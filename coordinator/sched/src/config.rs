@@ -1,9 +1,10 @@
 //! What can be tuned, and the limits that cannot.
 
+use serde::{Deserialize, Serialize};
 use terrafarm_common::accuracy::Share;
 
 /// The most workers connected at once; more are dropped as they join.
-pub const MAX_WORKERS: usize = 4096;
+pub const MAX_WORKERS: usize = 16_384;
 /// The most shots queued or running at once; more are refused.
 pub const MAX_SHOTS: usize = 256;
 /// The most frames of one shot: 46 hours at 60 Hz. Frames cost memory only in flight.
@@ -14,7 +15,7 @@ pub const MAX_FRAMES_IN_FLIGHT: u32 = 1024;
 pub const MAX_JOBS_PER_FRAME: u64 = 16_384;
 
 /// Settings of the scheduler. The defaults are for batch rendering on a local network.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Config {
     /// Jobs that wait at a worker behind the running one, so that the network is hidden.
     pub queue_depth: usize,

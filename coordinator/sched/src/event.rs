@@ -1,10 +1,13 @@
 //! What can happen, and what the scheduler may ask for.
 
+use serde::{Deserialize, Serialize};
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::{Region, Split};
 
 /// A time: microseconds since any fixed moment, the same for all events of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize,
+)]
 pub struct Micros(pub u64);
 
 impl Micros {
@@ -22,7 +25,7 @@ impl Micros {
 
 /// Something that happened. Events about a worker or a shot that is not known, or no
 /// longer, change nothing; a result from one is refused.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Event {
     /// When a worker has finished its handshake. A second join of the same worker
     /// changes nothing.
@@ -156,7 +159,7 @@ pub enum Event {
 }
 
 /// Something to be done, in the order given.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub enum Action {
     /// Send a job. A worker runs its jobs in the order of their grants.
     Grant {
@@ -326,7 +329,7 @@ pub enum Action {
 }
 
 /// Complete frames of a shot.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SentFrames {
     /// The shot.
     pub shot: ShotId,
@@ -336,7 +339,7 @@ pub struct SentFrames {
 }
 
 /// Why a worker is distrusted.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum Distrust {
     /// When others agree on something else.
     #[error("its {} x {} pixels at ({}, {}) of frame {frame} of {shot} differ from those of {}, which agree",
@@ -373,7 +376,7 @@ fn named(workers: &[WorkerId]) -> String {
 }
 
 /// How a connection ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LostReason {
     /// The worker said that it leaves.
     Left,
@@ -384,7 +387,7 @@ pub enum LostReason {
 }
 
 /// Why pixels are thrown away. All three are part of normal work.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum RefuseReason {
     /// The lease has ended: it expired, or the job was revoked or granted to another.
     Stale,
@@ -395,7 +398,7 @@ pub enum RefuseReason {
 }
 
 /// Why a worker is dropped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum DropReason {
     /// When no byte came for [`crate::Config::silence_us`].
     #[error("silent for {silence_us} us, probes unanswered; is the machine asleep or unplugged?")]
@@ -412,7 +415,7 @@ pub enum DropReason {
 }
 
 /// Why a frame failed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum FrameFailure {
     /// When one of its jobs failed too often.
     #[error("{} x {} pixels at ({}, {}) failed {tries} times, at last on {worker}: {reason}",
@@ -430,7 +433,7 @@ pub enum FrameFailure {
 }
 
 /// Why a shot failed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum ShotFailure {
     /// When [`crate::MAX_SHOTS`] are queued.
     #[error(

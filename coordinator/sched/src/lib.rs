@@ -38,6 +38,7 @@ mod check;
 mod config;
 mod event;
 mod grant;
+pub mod journal;
 mod lease;
 mod order;
 mod outcome;

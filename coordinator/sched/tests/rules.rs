@@ -7,6 +7,7 @@ use std::collections::VecDeque;
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::{Region, Split};
+use terrafarm_sched::journal::{JOURNAL_BYTES, Recorder, replay};
 use terrafarm_sched::*;
 
 const SECOND: u64 = 1_000_000;
@@ -591,5 +592,28 @@ proptest! {
             (told, scheduler.next_deadline(), scheduler.account())
         };
         prop_assert_eq!(play(), play());
+    }
+
+    #[test]
+    fn any_story_on_record_replays_to_the_same_actions(story in any_story(), seed in any::<u64>()) {
+        let config = Config::default();
+        let mut scheduler = Scheduler::new(config.clone(), seed);
+        let mut recorder = Recorder::begin(Vec::new(), &config, seed, JOURNAL_BYTES).unwrap();
+        let (mut now, mut asked, events) = (0u64, 0, story.len() as u64);
+        for (step, event) in story {
+            now = now.saturating_add(step);
+            recorder.handle(&mut scheduler, Micros(now), event).unwrap();
+            // The owner may fetch what is asked for later, and some of it.
+            if !now.is_multiple_of(3) {
+                asked += std::iter::from_fn(|| scheduler.poll_action()).take(3).count() as u64;
+            }
+        }
+        asked += std::iter::from_fn(|| scheduler.poll_action()).count() as u64;
+        recorder.finish().unwrap();
+        let report = replay(&*recorder.into_inner()).unwrap();
+        prop_assert_eq!(&report.first_difference, &None);
+        prop_assert_eq!((report.proved, report.actions), (events, asked));
+        prop_assert_eq!(report.account, scheduler.account());
+        prop_assert!(report.invariants.is_clean(), "{:?}", report.first_violation);
     }
 }

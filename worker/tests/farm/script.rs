@@ -11,6 +11,7 @@ use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, Trust, accept};
 use terrafarm_wire::message::{Blob, Hello, NoBlob, WantBlobs};
+use terrafarm_worker::office::Rules;
 use terrafarm_worker::render::Scene;
 use terrafarm_worker::{Caster, Ended, RayCaster, Reconnect, WorkerConfig, WorkerError, run_with};
 use tokio::net::{TcpListener, TcpStream};
@@ -53,6 +54,8 @@ impl Coordinator {
             cache_dir: cache_dir.map(Path::to_owned),
             cache_limit_bytes: 1 << 30,
             memory_limit_bytes: 1 << 30,
+            rules: Rules::default(),
+            bandwidth_bytes_per_s: None,
             reconnect: Reconnect {
                 attempts: Some(3),
                 first: Duration::from_millis(1),
@@ -60,6 +63,12 @@ impl Coordinator {
             },
             seed: 5,
         }
+    }
+
+    /// Whether no connection waits to be accepted.
+    pub fn nobody_came(&self) -> bool {
+        let mut context = std::task::Context::from_waker(std::task::Waker::noop());
+        self.listener.poll_accept(&mut context).is_pending()
     }
 
     pub async fn welcome(&self) -> Peer {

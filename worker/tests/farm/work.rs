@@ -159,3 +159,49 @@ async fn on_shutdown_the_job_that_runs_is_finished_and_the_others_handed_back() 
     assert!(peer.recv().await.is_none());
     assert_eq!(running.ended.await.unwrap().unwrap(), Ended::Stopped);
 }
+
+#[tokio::test]
+async fn a_worker_comes_only_within_its_hours_and_can_be_stopped_outside() {
+    let coordinator = Coordinator::new().await;
+    let now = jiff::Zoned::now();
+    let around = |from: i64, to: i64| {
+        let at = |hours: i64| {
+            (&now + jiff::SignedDuration::from_hours(hours)).strftime("%H:%M").to_string()
+        };
+        Some(format!("{}-{}", at(from), at(to)).parse().unwrap())
+    };
+    let mut config = coordinator.config(None);
+    config.rules.hours = around(2, 3);
+    let mut outside = start(config);
+    assert!(coordinator.nobody_came(), "it is outside its hours");
+    outside.stop.send(()).unwrap();
+    assert_eq!((&mut outside.ended).await.unwrap().unwrap(), Ended::Stopped);
+    assert!(coordinator.nobody_came());
+
+    let mut config = coordinator.config(None);
+    config.rules.hours = around(-1, 1);
+    let inside = start(config);
+    let mut peer = coordinator.welcome().await;
+    peer.send(Ping { number: 1 }).await;
+    assert_eq!(peer.recv().await, Some(Pong { number: 1 }.into()));
+    inside.stop.send(()).unwrap();
+    assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
+    assert_eq!(inside.ended.await.unwrap().unwrap(), Ended::Stopped);
+}
+
+#[tokio::test]
+async fn a_polite_worker_on_a_slow_line_gives_the_same_pixels() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let mut config = coordinator.config(None);
+    config.rules.polite = true;
+    config.bandwidth_bytes_per_s = Some(2_000_000);
+    let running = start(config);
+    let mut peer = coordinator.welcome().await;
+    peer.send(terrain.open(1, 1)).await;
+    peer.send(grant(1, 1, whole())).await;
+    let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+    let pixels = done.pixels.unpack(whole().area() as usize * 3).unwrap();
+    assert!(pixels == terrain.expected(&grant(0, 1, whole()), 1));
+    running.stop.send(()).unwrap();
+}

@@ -2,6 +2,11 @@
 
 use crate::rng::Rng;
 
+/// What hangs on one switch, share of the workers.
+pub(crate) const SWITCH_SHARE: f64 = 0.2;
+/// How long a switch carries nothing, shortest and longest, microseconds.
+pub(crate) const SWITCH_CUT_US: (u64, u64) = (1_000_000, 30_000_000);
+
 /// How much goes wrong. Shares are of the workers, each hit at a random moment in
 /// `within_s`; the first worker is spared by all that would end its work for good.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -27,8 +32,15 @@ pub struct Faults {
     pub hand_backs: f64,
     /// Workers that fail at every job.
     pub unfit: f64,
-    /// Workers with a link fifty times slower than the others'.
+    /// Workers with a link that is 20 times (wireless) or 200 times (from home) narrower
+    /// than the others', and longer.
     pub slow_links: f64,
+    /// How often a switch carries nothing for 1 to 30 s and then everything that was held
+    /// back; each time a fifth of the workers, neighbours, is behind it.
+    pub switch_cuts: u32,
+    /// How long a worker stays each time, seconds, on average; 0 for ever. It leaves in
+    /// good order, crashes or loses power, one as often as the other, all through the run.
+    pub stay_s: f64,
     /// Whether machines that crashed, left or lost power come back after up to 10 s.
     pub come_back: bool,
     /// Share of messages that are lost. TCP loses none; the scheduler does not rely on it.
@@ -61,6 +73,31 @@ impl Faults {
             loss: share(0.05),
             duplicates: share(0.1),
             failures: if deadly { share(0.05) } else { 0.0 },
+            switch_cuts: (share(4.0)) as u32,
+            stay_s: share(30.0),
+        }
+    }
+
+    /// Everything at once, and little enough of each that the farm still gets on.
+    pub fn every(within_s: f64) -> Self {
+        Faults {
+            within_s,
+            late: 0.2,
+            crashes: 0.1,
+            power_cuts: 0.1,
+            partitions: 0.2,
+            hangs: 0.1,
+            stuck: 0.03,
+            drains: 0.1,
+            hand_backs: 0.1,
+            unfit: 0.03,
+            slow_links: 0.3,
+            switch_cuts: 3,
+            stay_s: 40.0,
+            come_back: true,
+            loss: 0.002,
+            duplicates: 0.005,
+            failures: 0.001,
         }
     }
 }

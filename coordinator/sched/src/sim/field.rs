@@ -1,5 +1,6 @@
 //! What the columns of made-up frames cost: hills that pass through the picture.
 
+use super::SimConfig;
 use crate::rng::Rng;
 use terrafarm_common::id::FrameIndex;
 use terrafarm_common::region::Region;
@@ -10,6 +11,8 @@ const HILL: f64 = 1.0 / 6.0;
 const DRIFT: f64 = 0.004;
 /// Frames over which the level of the costs changes.
 const LEVEL_FRAMES: f64 = 60.0;
+/// Frames between two cuts of the film, where frames differ much.
+const CUT_FRAMES: u32 = 40;
 /// Width of the sample columns, pixels.
 const STEP_PX: u32 = 8;
 
@@ -20,21 +23,26 @@ pub(crate) struct Field {
     width: u32,
     height: u32,
     skew: f64,
+    frame_skew: f64,
     px_us: f64,
 }
 
 impl Field {
-    /// A field whose frames cost about `frame_us` each.
-    pub(crate) fn new(seed: u64, (width, height): (u32, u32), frame_us: f64, skew: f64) -> Self {
+    /// A field with frames of this size, as the settings want it.
+    pub(crate) fn new(seed: u64, (width, height): (u32, u32), config: &SimConfig) -> Self {
+        let SimConfig { skew, frame_skew, .. } = *config;
         let area = f64::from(width.max(1)) * f64::from(height.max(1));
         // Noise is 0.5 on average, so that this makes the mean factor 1.
-        let px_us = frame_us / area / (1.0 + 0.5 * skew);
-        Field { seed, width, height, skew, px_us }
+        let mean = (1.0 + 0.5 * skew) * (1.0 + 0.5 * frame_skew);
+        let px_us = config.frame_work_s * 1e6 / area / mean;
+        Field { seed, width, height, skew, frame_skew, px_us }
     }
 
     /// Cost of a region, microseconds at speed 1: the same however it is cut.
     pub(crate) fn cost_us(&self, frame: FrameIndex, region: Region) -> f64 {
-        let level = 0.7 + 0.6 * self.noise(1, f64::from(frame) / LEVEL_FRAMES);
+        let scene = f64::from(frame / CUT_FRAMES);
+        let level = (0.7 + 0.6 * self.noise(1, f64::from(frame) / LEVEL_FRAMES))
+            * (1.0 + self.frame_skew * self.noise(3, scene));
         let mut columns = 0.0;
         let mut x = region.x;
         while x < region.x + region.width {
@@ -69,9 +77,13 @@ mod tests {
     use super::*;
     use terrafarm_common::region::{columns, tiles};
 
+    fn of_a_second(frame_skew: f64) -> SimConfig {
+        SimConfig { frame_work_s: 1.0, skew: 4.0, frame_skew, ..SimConfig::default() }
+    }
+
     #[test]
     fn a_frame_costs_the_same_however_it_is_cut() {
-        let field = Field::new(3, (500, 300), 1e6, 4.0);
+        let field = Field::new(3, (500, 300), &of_a_second(9.0));
         let whole = field.cost_us(7, Region::whole(500, 300));
         let cuts = [columns(500, 300, &[8, 48, 133, 400]), tiles(500, 300, 37)];
         for cut in cuts {
@@ -82,7 +94,7 @@ mod tests {
 
     #[test]
     fn frames_cost_about_what_was_asked_for_and_columns_differ() {
-        let field = Field::new(5, (1920, 1080), 1e6, 4.0);
+        let field = Field::new(5, (1920, 1080), &of_a_second(0.0));
         let mean =
             (0..2000).map(|f| field.cost_us(f, Region::whole(1920, 1080))).sum::<f64>() / 2e3;
         assert!((0.7e6..1.3e6).contains(&mean), "{mean}");
@@ -91,5 +103,17 @@ mod tests {
         let (least, most) =
             costs.iter().fold((f64::MAX, 0.0f64), |(a, b), &c| (a.min(c), b.max(c)));
         assert!(most > 1.5 * least, "{least} {most}");
+    }
+
+    #[test]
+    fn frames_differ_from_scene_to_scene_and_still_cost_what_was_asked_for() {
+        let field = Field::new(5, (1920, 1080), &of_a_second(9.0));
+        let cost = |frame| field.cost_us(frame, Region::whole(1920, 1080));
+        let costs: Vec<f64> = (0..200).map(|scene| cost(scene * CUT_FRAMES)).collect();
+        let mean = costs.iter().sum::<f64>() / 200.0;
+        assert!((0.7e6..1.3e6).contains(&mean), "{mean}");
+        let (least, most) =
+            costs.iter().fold((f64::MAX, 0.0f64), |(a, b), &c| (a.min(c), b.max(c)));
+        assert!(most > 5.0 * least, "{least} {most}");
     }
 }

@@ -26,6 +26,8 @@ pub struct Violations {
     pub lease_ends: u64,
     /// Results without exactly one verdict, or with a wrong one.
     pub verdicts: u64,
+    /// Results accepted from workers that had been given up.
+    pub zombie_pixels: u64,
     /// Grants to workers that were lost, draining or blocked.
     pub bad_grants: u64,
     /// Grants that put more frames in flight than allowed.
@@ -75,6 +77,8 @@ pub(crate) struct Judge {
     distrusted: BTreeSet<WorkerId>,
     shots: BTreeMap<ShotId, Watched>,
     held: BTreeMap<LeaseId, (WorkerId, ShotId, FrameIndex)>,
+    /// The same leases, by their holders.
+    held_by: BTreeMap<WorkerId, BTreeSet<LeaseId>>,
     last_lease: u64,
     awaiting: Option<(WorkerId, LeaseId)>,
 }
@@ -84,7 +88,7 @@ impl Judge {
     pub(crate) fn event(&mut self, event: &Event) {
         match event {
             Event::WorkerJoined { worker, .. } => {
-                self.workers.insert(*worker, false);
+                self.workers.entry(*worker).or_insert(false);
             }
             Event::WorkerLost { worker, .. } => self.gone(*worker),
             Event::WorkerDraining { worker } => {
@@ -98,19 +102,16 @@ impl Judge {
             }
             Event::JobFailed { worker, lease, .. } => self.give_up(*worker, *lease),
             Event::ShotSubmitted { shot, frames, width, height, frames_in_flight, .. } => {
-                self.shots.insert(
-                    *shot,
-                    Watched {
-                        frames: *frames,
-                        size: (*width, *height),
-                        limit: *frames_in_flight,
-                        open: BTreeMap::new(),
-                        done: BTreeSet::new(),
-                        untaken: BTreeSet::new(),
-                        failed: 0,
-                        blocked: BTreeSet::new(),
-                    },
-                );
+                self.shots.entry(*shot).or_insert_with(|| Watched {
+                    frames: *frames,
+                    size: (*width, *height),
+                    limit: *frames_in_flight,
+                    open: BTreeMap::new(),
+                    done: BTreeSet::new(),
+                    untaken: BTreeSet::new(),
+                    failed: 0,
+                    blocked: BTreeSet::new(),
+                });
             }
             Event::JobDone { worker, lease, .. } => self.awaiting = Some((*worker, *lease)),
             Event::FrameTaken { shot, frame } => {
@@ -119,8 +120,8 @@ impl Judge {
                 }
             }
             Event::WorkerCleared { worker, .. } => _ = self.distrusted.remove(worker),
-            Event::ShotCanceled { .. }
-            | Event::ShotPaused { .. }
+            Event::ShotCanceled { shot } => _ = self.shots.remove(shot),
+            Event::ShotPaused { .. }
             | Event::ShotResumed { .. }
             | Event::ShotPrioritised { .. }
             | Event::WorkerDistrusted { .. }
@@ -248,6 +249,7 @@ impl Judge {
         let may_work = self.may_work(worker, id);
         self.expect(may_work, |v| &mut v.bad_grants, || format!("{worker} got {lease}"));
         self.held.insert(lease, (worker, id, frame));
+        self.held_by.entry(worker).or_default().insert(lease);
         let Some(shot) = self.shots.get_mut(&id) else { return };
         let is_open = !shot.done.contains(&frame) && frame < shot.frames;
         let picture = shot.open.entry(frame).or_default();
@@ -282,6 +284,8 @@ impl Judge {
 
     fn accepted(&mut self, lease: LeaseId, id: ShotId, frame: FrameIndex, region: Region) {
         let awaited = self.awaiting.take();
+        let is_alive = awaited.is_none_or(|(worker, _)| self.workers.contains_key(&worker));
+        self.expect(is_alive, |v| &mut v.zombie_pixels, || format!("{lease} of a zombie accepted"));
         let ended = awaited.and_then(|(worker, _)| self.end(worker, lease));
         let is_right = awaited.is_some_and(|(_, awaited)| awaited == lease)
             && ended == Some((id, frame, Some(region)));
@@ -327,6 +331,9 @@ impl Judge {
             return None;
         }
         self.held.remove(&lease);
+        if let Some(of_worker) = self.held_by.get_mut(&worker) {
+            of_worker.remove(&lease);
+        }
         let picture = self.shots.get_mut(&id).and_then(|shot| shot.open.get_mut(&frame));
         Some((id, frame, picture.and_then(|picture| picture.held.remove(&lease))))
     }
@@ -340,13 +347,7 @@ impl Judge {
         if self.workers.remove(&worker).is_none() {
             return;
         }
-        let leases: Vec<LeaseId> = self
-            .held
-            .iter()
-            .filter(|(_, held)| held.0 == worker)
-            .map(|(&lease, _)| lease)
-            .collect();
-        for lease in leases {
+        for lease in self.held_by.remove(&worker).unwrap_or_default() {
             self.give_up(worker, lease);
         }
         self.unblock(worker);
@@ -377,6 +378,7 @@ fn overlap(a: Region, b: Region) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::event::LostReason;
 
     const WORKER: WorkerId = WorkerId(1);
     const SHOT: ShotId = ShotId(1);
@@ -442,6 +444,10 @@ mod tests {
         judge.event(&Event::WorkerDraining { worker: WORKER });
         judge.action(&grant(5, 0));
         assert_eq!(judge.violations.bad_grants, 1);
+        judge.event(&Event::WorkerLost { worker: WORKER, why: LostReason::Broken });
+        accept(&mut judge, 5);
+        assert_eq!(judge.violations.zombie_pixels, 1);
+        judge.action(&grant(6, 0));
         judge.ended(99);
         assert_eq!(judge.violations.unfinished, 1);
         assert_eq!(judge.violations.lease_ends, 1);

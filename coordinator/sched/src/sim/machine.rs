@@ -1,9 +1,17 @@
 //! One made-up machine with its worker program and its link.
 
-use super::fault::Fault;
+use super::SimConfig;
+use super::fault::{self, Fault};
+use crate::rng::Rng;
 use std::collections::VecDeque;
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::region::Region;
+
+/// What a wireless link carries of what a wire does, and how much longer it takes, shortest
+/// and longest, microseconds.
+const WIRELESS: (f64, (u64, u64)) = (0.05, (2_000, 30_000));
+/// The same over the internet.
+const FROM_HOME: (f64, (u64, u64)) = (0.005, (15_000, 80_000));
 
 /// A job as a worker sees it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,10 +56,6 @@ pub(crate) struct Machine {
     pub(crate) is_unfit: bool,
     /// Leaves when the job it renders is done.
     pub(crate) is_leaving: bool,
-    /// Since when it has been there, if it is.
-    pub(crate) present_since_us: Option<u64>,
-    /// How long it was there before that.
-    pub(crate) present_us: u64,
     /// How long it rendered.
     pub(crate) rendered_us: u64,
     /// What will go wrong.
@@ -59,7 +63,38 @@ pub(crate) struct Machine {
 }
 
 impl Machine {
-    /// Switched off, or cut off for good as far as the program is concerned.
+    /// A machine that is switched off. One that is spared is fit, and nothing will end its
+    /// work for good.
+    pub(crate) fn new(config: &SimConfig, is_spared: bool, rng: &mut Rng) -> Machine {
+        let (slowest, fastest) = config.speeds;
+        // Evenly over the logarithm, without a logarithm: the mean of a straight and a
+        // reciprocal ramp is close to it, and the same on every machine.
+        let at = rng.unit();
+        let straight = slowest + (fastest - slowest) * at;
+        let reciprocal = 1.0 / (1.0 / slowest + (1.0 / fastest - 1.0 / slowest) * at);
+        let speed = 0.5 * (straight + reciprocal);
+        let (latency_us, bytes_per_us) = link(config, rng);
+        let faults = fault::plan(&config.faults, is_spared, rng);
+        Machine {
+            connection: None,
+            speed,
+            threads: (4.0 * speed).ceil() as u32,
+            latency_us,
+            bytes_per_us,
+            queue: VecDeque::new(),
+            running: None,
+            cut_until_us: 0,
+            hangs_until_us: 0,
+            sent_at_us: 0,
+            is_stuck: false,
+            is_unfit: !is_spared && rng.unit() < config.faults.unfit,
+            is_leaving: false,
+            rendered_us: 0,
+            faults,
+        }
+    }
+
+    /// It has no jobs any more, and knows of none.
     pub(crate) fn clear(&mut self, now_us: u64) {
         if let Some(running) = self.running.take() {
             self.rendered_us += now_us.saturating_sub(running.began_us).min(running.takes_us);
@@ -67,13 +102,18 @@ impl Machine {
         self.queue.clear();
         self.is_leaving = false;
     }
+}
 
-    /// Switches it off.
-    pub(crate) fn switch_off(&mut self, now_us: u64) {
-        self.clear(now_us);
-        self.connection = None;
-        if let Some(since) = self.present_since_us.take() {
-            self.present_us += now_us - since;
-        }
-    }
+/// The one-way delay of a link, microseconds, and the bytes that it carries in one. Half of
+/// the slow ones are wireless, half come over the internet from a home.
+fn link(config: &SimConfig, rng: &mut Rng) -> (u64, f64) {
+    let (least_us, most_us) = config.latency_us;
+    let near_us = least_us + rng.below(most_us.saturating_sub(least_us));
+    let draw = rng.unit() / config.faults.slow_links;
+    let (share, (least_us, most_us)) = match draw {
+        ..0.5 => WIRELESS,
+        ..1.0 => FROM_HOME,
+        _ => return (near_us, config.link_bytes_per_us),
+    };
+    (near_us + least_us + rng.below(most_us - least_us), config.link_bytes_per_us * share)
 }

@@ -8,17 +8,28 @@
 
 mod fault;
 mod field;
-mod judge;
+pub(crate) mod judge;
 mod machine;
+mod tally;
+mod workers;
 mod world;
 
 pub use fault::Faults;
 pub use judge::Violations;
+pub use tally::Spread;
 
 use crate::config::Config;
+use crate::journal::Stopped;
 use crate::scheduler::Account;
 use serde::Serialize;
+use std::io::Write;
 use terrafarm_common::region::Split;
+
+/// Mean speed of workers between the default bounds.
+const MEAN_SPEED: f64 = 1.68;
+/// Work of the whole farm that is in flight, seconds. Frames are stored in their order: if
+/// a worker dies, the others can go on for so long until a copy of its job is done.
+const AHEAD_S: f64 = 1.2;
 
 /// What is simulated.
 #[derive(Debug, Clone)]
@@ -27,8 +38,10 @@ pub struct SimConfig {
     pub workers: u32,
     /// Everything random follows from it.
     pub seed: u64,
-    /// Shots, submitted together, all alike; every second one has a higher priority.
+    /// Shots, all alike but for their priority: 0, 1, 2, and again.
     pub shots: u32,
+    /// The first shot is submitted at once, the others within this time, seconds.
+    pub arrive_within_s: f64,
     /// Frames of each shot.
     pub frames: u32,
     /// Width of the frames, pixels.
@@ -44,6 +57,9 @@ pub struct SimConfig {
     /// How uneven the columns of a frame are: the costliest take about `1 + skew` times
     /// as long as the cheapest.
     pub skew: f64,
+    /// How uneven the scenes of a shot are: frames after a cut of the film take up to
+    /// `1 + frame_skew` times as long as those before it.
+    pub frame_skew: f64,
     /// Slowest and fastest worker; speeds are spread evenly over the ratio between them.
     pub speeds: (f64, f64),
     /// Shortest and longest one-way delay of the links, microseconds.
@@ -69,6 +85,7 @@ impl Default for SimConfig {
             workers: 31,
             seed: 1,
             shots: 1,
+            arrive_within_s: 0.0,
             frames: 600,
             width: 1920,
             height: 1080,
@@ -76,6 +93,7 @@ impl Default for SimConfig {
             frames_in_flight: 16,
             frame_work_s: 4.0,
             skew: 4.0,
+            frame_skew: 0.0,
             speeds: (0.5, 4.0),
             latency_us: (100, 1000),
             link_bytes_per_us: 118.0,
@@ -94,13 +112,14 @@ impl SimConfig {
     pub fn for_workers(workers: u32, seed: u64) -> Self {
         let base = SimConfig::default();
         let frame_work_s = base.frame_work_s.max(f64::from(workers) / 50.0);
-        let speed = 1.68 * f64::from(workers.max(1));
+        let speed = MEAN_SPEED * f64::from(workers.max(1));
+        let ahead = (AHEAD_S * speed / frame_work_s).ceil() as u32;
         SimConfig {
             workers,
             seed,
             frames: (60.0 * speed / frame_work_s).ceil() as u32,
             frame_work_s,
-            frames_in_flight: base.frames_in_flight.max(workers / 10),
+            frames_in_flight: base.frames_in_flight.max(workers / 10).max(ahead),
             ..base
         }
     }
@@ -114,7 +133,7 @@ pub struct SimReport {
     /// The seed.
     pub seed: u64,
     /// Work that was asked for over the work that the workers could have done while they
-    /// were there: the ideal time over the makespan.
+    /// were there and a shot was open: the ideal time over the makespan.
     pub efficiency: f64,
     /// From the first submission to the last frame, virtual seconds.
     pub makespan_s: f64,
@@ -128,6 +147,15 @@ pub struct SimReport {
     pub redo_share: f64,
     /// Where the workers' time went.
     pub time: TimeShares,
+    /// From the first job of a frame to its last pixel.
+    pub frame_latency_s: Spread,
+    /// From the moment in which a machine lost power to that in which the scheduler gave
+    /// it up. Those that had nothing to say for themselves until the end are not counted.
+    pub notice_s: Spread,
+    /// Results of workers that had been given up, all refused.
+    pub zombies: u64,
+    /// Events that the scheduler was told.
+    pub events: u64,
     /// What became of the leases.
     pub account: Account,
     /// What must not happen, and did: all zero.
@@ -149,5 +177,19 @@ pub struct TimeShares {
 
 /// Plays one run.
 pub fn simulate(config: &SimConfig) -> SimReport {
-    world::World::new(config).run()
+    let played = world::World::new(config, None).and_then(world::World::run);
+    played.expect("only a record can stop, and there is none")
+}
+
+/// Plays one run, and writes all that the scheduler is told into a [`crate::journal`] of at
+/// most so many bytes.
+///
+/// # Errors
+/// If the journal could not be kept to the end.
+pub fn record(
+    config: &SimConfig,
+    journal: &mut dyn Write,
+    limit_bytes: u64,
+) -> Result<SimReport, Stopped> {
+    world::World::new(config, Some((journal, limit_bytes)))?.run()
 }

@@ -15,6 +15,7 @@ use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::Resident;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_worker::RayCaster;
+use terrafarm_worker::office::Gate;
 use terrafarm_worker::render::{Check, Job, Outcome, Picture, Scene};
 use terrafarm_worker::terrain::Terrain;
 
@@ -95,9 +96,10 @@ impl<'s> Cache<'s> {
         let stop = Arc::new(AtomicBool::new(false));
         let job = Job::new(&RayCaster, LeaseId(0), view.clone(), frame, Check::default(), stop);
         let mut job = Box::new(job);
+        let gate = Gate::new(rayon::current_num_threads());
         loop {
             let scene = self.scene()?;
-            let outcome = job.advance(&RayCaster, &scene).map_err(anyhow::Error::msg)?;
+            let outcome = job.advance(&RayCaster, &scene, &gate).map_err(anyhow::Error::msg)?;
             drop(scene);
             match outcome {
                 Outcome::Done(picture) => return Ok(picture),
