@@ -26,7 +26,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A coordinator with a queue and a page.
 pub struct Office {
-    pub running: Running,
+    _running: Running,
     /// Where workers and commands connect.
     pub address: String,
     /// Where HTTP is.
@@ -45,7 +45,7 @@ pub fn office(dir: &Dir, more: &[&str]) -> Office {
     let address = running.expect("coordinator on ").rsplit(' ').next().unwrap().to_owned();
     let line = running.expect("look at it:");
     let http = line.split("http://").nth(1).unwrap().split('/').next().unwrap().to_owned();
-    Office { running, address, http }
+    Office { _running: running, address, http }
 }
 
 impl Office {

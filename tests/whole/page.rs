@@ -102,10 +102,13 @@ impl Browser {
         answer["result"]["value"].take()
     }
 
-    /// Waits until an expression is true.
+    /// Waits until an expression is true; while what it asks about is not there, it is not.
     fn expect(&mut self, expression: &str) {
         let deadline = Instant::now() + PATIENCE;
-        while self.ask(&format!("Boolean({expression})")) != true {
+        let asked = format!(
+            "(() => {{ try {{ return Boolean({expression}); }} catch {{ return false; }} }})()"
+        );
+        while self.ask(&asked) != true {
             if Instant::now() > deadline {
                 let text = self.ask("document.body.innerText");
                 panic!("{expression} does not come true on\n{text}\n{:#?}", self.complaints);

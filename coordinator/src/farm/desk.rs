@@ -144,7 +144,7 @@ impl Farm {
                 terrain,
                 blocked: tally
                     .map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
-                distrusted: false,
+                distrusted: self.trust.is_distrusted(&state.greeting.name),
             }
         };
         self.workers.iter().map(view).collect()

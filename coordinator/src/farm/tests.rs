@@ -1,5 +1,7 @@
 #![allow(clippy::unwrap_used)]
 
+mod seen;
+
 use super::*;
 use bytes::Bytes;
 use glam::DVec3;
@@ -52,24 +54,27 @@ impl Bench {
     /// A client with a shot of so many frames.
     fn submit(&mut self, frames: u32) -> Vec<Out> {
         self.join(Peer::Client(CLIENT), 0);
-        let submit = Submit {
-            number: 1,
-            name: "test".into(),
-            index: BlobHash([1; 32]),
-            shading: shading(),
-            quality: Quality::default(),
-            check: Share::NONE,
-            width: SIZE.0,
-            height: SIZE.1,
-            split: Split::Columns,
-            frames,
-            frames_in_flight: 2,
-            priority: 0,
-        };
-        self.say(Peer::Client(CLIENT), submit);
+        self.say(Peer::Client(CLIENT), submission(frames));
         let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
         let cameras = vec![camera; frames as usize];
         self.say(Peer::Client(CLIENT), Cameras { number: 1, first: 0, cameras })
+    }
+}
+
+fn submission(frames: u32) -> Submit {
+    Submit {
+        number: 1,
+        name: "test".into(),
+        index: BlobHash([1; 32]),
+        shading: shading(),
+        quality: Quality::default(),
+        check: Share::NONE,
+        width: SIZE.0,
+        height: SIZE.1,
+        split: Split::Columns,
+        frames,
+        frames_in_flight: 2,
+        priority: 0,
     }
 }
 
