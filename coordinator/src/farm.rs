@@ -293,7 +293,7 @@ impl Farm {
             }
         }
         for (client, hashes) in asks {
-            self.send(Peer::Client(client), WantBlobs { hashes });
+            self.send(Peer::Client(client), WantBlobs { hashes, elsewhere: false });
         }
     }
 

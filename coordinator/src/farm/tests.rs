@@ -244,14 +244,14 @@ fn terrain_goes_from_the_client_to_every_worker_that_wants_it() {
     bench.submit(4);
     let bytes = Bytes::from_static(b"tile");
     let hash = hash_of(&bytes);
-    let want = || WantBlobs { hashes: vec![hash] };
+    let want = || WantBlobs { hashes: vec![hash], elsewhere: true };
     let out = bench.say(worker(1), want());
     assert!(matches!(&out[..], [Out::Send(Peer::Client(CLIENT), Message::WantBlobs(_))]));
     assert!(bench.say(worker(2), want()).is_empty(), "asked already");
     let out = bench.say(Peer::Client(CLIENT), Blob { hash, bytes });
     assert_eq!(out.len(), 2);
     let wrong = BlobHash([9; 32]);
-    bench.say(worker(1), WantBlobs { hashes: vec![wrong] });
+    bench.say(worker(1), WantBlobs { hashes: vec![wrong], elsewhere: true });
     let out =
         bench.say(Peer::Client(CLIENT), Blob { hash: wrong, bytes: Bytes::from_static(b"x") });
     assert!(matches!(&out[..], [Out::Send(Peer::Worker(_), Message::NoBlob(_))]), "{out:?}");

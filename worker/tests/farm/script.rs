@@ -91,7 +91,7 @@ impl Peer {
     pub async fn serve(&mut self, terrain: &Terrain) -> Option<Message> {
         loop {
             match self.recv().await {
-                Some(Message::WantBlobs(WantBlobs { hashes })) => {
+                Some(Message::WantBlobs(WantBlobs { hashes, .. })) => {
                     self.asked.extend(&hashes);
                     for hash in hashes.into_iter().rev() {
                         match terrain.blobs.get(&hash) {

@@ -40,6 +40,8 @@ pub enum Role {
     },
     /// Submits shots, supplies their terrain, takes their frames.
     Client,
+    /// Another worker: asks for terrain blobs by hash, and for nothing else.
+    Peer,
 }
 
 impl Role {
@@ -48,6 +50,7 @@ impl Role {
         match self {
             Role::Worker { .. } => "worker",
             Role::Client => "client",
+            Role::Peer => "peer",
         }
     }
 }

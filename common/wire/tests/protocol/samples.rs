@@ -104,7 +104,7 @@ pub fn all() -> Vec<(String, Message)> {
         Ping { number: 1 }.into(),
         Pong { number: u64::MAX }.into(),
         Goodbye { reason: text() }.into(),
-        WantBlobs { hashes: vec![hash, BlobHash([255; 32])] }.into(),
+        WantBlobs { hashes: vec![hash, BlobHash([255; 32])], elsewhere: true }.into(),
         Blob { hash, bytes: b"a tile"[..].into() }.into(),
         NoBlob { hash, why: text() }.into(),
         OpenShot {
@@ -188,6 +188,14 @@ pub fn all() -> Vec<(String, Message)> {
         }
         .into(),
         ShotFailed { shot, reason: text() }.into(),
+        Elsewhere {
+            hash,
+            workers: vec!["10.0.0.7:4711".parse().unwrap(), "[fe80::7]:4712".parse().unwrap()],
+        }
+        .into(),
+        Sharing { port: 4711 }.into(),
+        Ahead { shot, first: frame, stride: 8, cameras: vec![camera(); 2] }.into(),
+        hello(Role::Peer).into(),
     ];
     let mut seen = 0;
     let named = messages.into_iter().map(|message| {
@@ -310,8 +318,17 @@ pub fn any_message() -> impl Strategy<Value = Message> {
             .into()
         },
     );
-    let want =
-        prop::collection::vec(any_hash(), 1..50).prop_map(|hashes| WantBlobs { hashes }.into());
+    let want = (prop::collection::vec(any_hash(), 1..50), any::<bool>())
+        .prop_map(|(hashes, elsewhere)| WantBlobs { hashes, elsewhere }.into());
+    let ahead = (0u32..1000, 1u32..1000, prop::collection::vec(any_camera(), 1..=64))
+        .prop_map(|(first, stride, cameras)| {
+            Ahead { shot: ShotId(7), first, stride, cameras }.into()
+        });
+    let elsewhere = (any_hash(), prop::collection::vec(any::<std::net::SocketAddr>(), 1..=4))
+        .prop_map(|(hash, mut workers)| {
+            workers.iter_mut().for_each(|worker| worker.set_port(worker.port().max(1)));
+            Elsewhere { hash, workers }.into()
+        });
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
     let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
@@ -325,5 +342,7 @@ pub fn any_message() -> impl Strategy<Value = Message> {
     let hand_back = prop::collection::vec(any::<u64>().prop_map(LeaseId), 0..50)
         .prop_map(|leases| HandBack { leases }.into());
     let sample = prop::sample::select(all()).prop_map(|(_, message)| message);
-    prop_oneof![open, grant, cameras, submit, want, blob, done, failed, hand_back, sample]
+    prop_oneof![
+        open, grant, cameras, submit, want, blob, done, failed, hand_back, ahead, elsewhere, sample
+    ]
 }
