@@ -7,16 +7,15 @@
 
 use crate::clock::{TaskClock, Worked};
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
-use crate::session::{Action, Doing, Event, Session};
+use crate::session::{Action, Doing, Event, Glance, Session};
 use crate::terrain::Terrain;
-use bytes::Bytes;
 use rayon::ThreadPool;
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-use terrafarm_common::id::{BlobHash, LeaseId};
+use terrafarm_common::id::{BlobHash, FrameIndex, LeaseId, ShotId};
 use terrafarm_raycast::View;
 use terrafarm_terrain::cache::BlobCache;
 use terrafarm_terrain::codec::{self, CodecError};
@@ -52,9 +51,14 @@ pub(crate) struct Site<C: Caster> {
 /// What the thread pool has done.
 enum Report<C: Caster> {
     Absent(BlobHash),
+    Damaged(BlobHash),
     Spoiled(BlobHash, String),
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
+    /// A tile before its turn, or what is on disk until then.
+    Early(BlobHash, Option<Tile>),
+    /// The tiles of a store that a frame will need.
+    Glanced(BlobHash, (ShotId, FrameIndex), Vec<TileKey>),
     Done(Box<Done>, Worked),
     Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
@@ -181,6 +185,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Send(message) => self.send(message, outbox),
                 Action::Load(hash) => self.load(hash),
                 Action::Take(blob) => self.take(blob),
+                Action::Seek(hash) => self.seek(hash),
+                Action::Stock(blob) => self.stock(blob),
+                Action::Fetch(elsewhere) => Some(Event::Unfetched(elsewhere.hash)),
+                Action::Glance(glance, shot) => self.glance(glance, &shot),
                 Action::Start(grant, shot) => self.start(&grant, &shot),
                 Action::Resume(lease) => self.resume(lease),
                 Action::Stop(_) => {
@@ -190,6 +198,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Discard(_) => {
                     self.paused = None;
                     self.clock.discard(Instant::now());
+                    None
+                }
+                Action::Close(shot) => {
+                    self.site.terrain.close_shot(shot);
                     None
                 }
                 Action::Release(store) => {
@@ -222,6 +234,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         if self.site.terrain.has_store(hash) {
             return Some(Event::Loaded(hash));
         }
+        if let Some(tile) = self.site.terrain.take_stowed(hash) {
+            return Some(self.add_tile(hash, &tile));
+        }
         let Some(cache) = self.site.cache.clone() else {
             return Some(Event::Absent(hash));
         };
@@ -242,20 +257,15 @@ impl<'a, C: Caster> Shift<'a, C> {
         let Blob { hash, bytes } = blob;
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         let cache = self.site.cache.clone();
-        let keep = move |bytes: &Bytes| {
-            if let Some(Err(error)) = cache.map(|cache| cache.put(&hash, bytes)) {
-                warn!(%error, "a terrain blob was not kept");
-            }
-        };
         self.spawn(
             move || {
                 counted(&unpacking_ns, || {
                     if hash_of(&bytes) != hash {
-                        return Report::Spoiled(hash, "what came has another hash".to_owned());
+                        return Report::Damaged(hash);
                     }
                     let report = decoded(&*caster, hash, &bytes);
                     if !matches!(report, Report::Spoiled(..)) {
-                        keep(&bytes);
+                        keep(cache.as_deref(), &hash, &bytes);
                     }
                     report
                 })
@@ -265,9 +275,65 @@ impl<'a, C: Caster> Shift<'a, C> {
         None
     }
 
+    /// Looks for a blob for later.
+    fn seek(&mut self, hash: BlobHash) -> Option<Event> {
+        let room = self.site.terrain.has_room_ahead();
+        let Some(cache) = self.site.cache.clone() else {
+            return Some(if room { Event::Absent(hash) } else { Event::NoRoom(hash) });
+        };
+        self.spawn_early(
+            move || match room {
+                true => match cache.get(&hash) {
+                    Some(bytes) => early(hash, &bytes),
+                    None => Report::Absent(hash),
+                },
+                false if cache.holds(&hash) => Report::Early(hash, None),
+                false => Report::Absent(hash),
+            },
+            move |panic| Report::Spoiled(hash, panic),
+        );
+        None
+    }
+
+    /// Keeps a blob for later: in memory if there is room, and on disk.
+    fn stock(&mut self, blob: Blob) -> Option<Event> {
+        let Blob { hash, bytes } = blob;
+        let room = self.site.terrain.has_room_ahead();
+        let cache = self.site.cache.clone();
+        if !room && cache.is_none() {
+            return Some(Event::NoRoom(hash));
+        }
+        self.spawn_early(
+            move || {
+                if hash_of(&bytes) != hash {
+                    return Report::Damaged(hash);
+                }
+                keep(cache.as_deref(), &hash, &bytes);
+                if room { early(hash, &bytes) } else { Report::Early(hash, None) }
+            },
+            move |panic| Report::Spoiled(hash, panic),
+        );
+        None
+    }
+
+    /// Finds out which tiles a view will need.
+    fn glance(&mut self, glance: Glance, shot: &OpenShot) -> Option<Event> {
+        let Some(scene) = self.site.terrain.scene(shot.index) else {
+            return Some(Event::Glanced(Vec::new()));
+        };
+        let Glance { shot: number, due, camera, region } = glance;
+        let view = View { camera, shading: shot.shading.clone(), quality: shot.quality };
+        let (caster, store, due) = (self.site.caster.clone(), shot.index, (number, due));
+        self.spawn_early(
+            move || Report::Glanced(store, due, caster.scout(&scene, &view, region)),
+            move |_| Report::Glanced(store, due, Vec::new()),
+        );
+        None
+    }
+
     fn start(&mut self, grant: &Grant, shot: &OpenShot) -> Option<Event> {
         debug!(lease = %grant.lease, shot = %grant.shot, frame = grant.frame, "job begins");
-        self.site.terrain.begin_job();
+        self.site.terrain.begin_job(grant.shot, grant.frame);
         let stop = Arc::new(AtomicBool::new(false));
         self.current = Some((shot.index, stop.clone()));
         let view =
@@ -322,6 +388,20 @@ impl<'a, C: Caster> Shift<'a, C> {
         let terrain = &mut self.site.terrain;
         match report {
             Report::Absent(hash) => Event::Absent(hash),
+            Report::Damaged(hash) => {
+                warn!(%hash, "a terrain blob came damaged and is fetched again");
+                Event::Damaged(hash)
+            }
+            Report::Early(hash, tile) => {
+                match tile {
+                    Some(tile) => terrain.stow(hash, tile),
+                    None => terrain.leave_on_disk(hash),
+                }
+                Event::Stocked(hash)
+            }
+            Report::Glanced(store, due, keys) => {
+                Event::Glanced(terrain.foresee_tiles(store, due, &keys))
+            }
             Report::Spoiled(hash, why) => {
                 terrain.give_up(hash);
                 Event::Spoiled(hash, why)
@@ -330,13 +410,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 terrain.add_store(hash, *resident, prepared);
                 Event::Loaded(hash)
             }
-            Report::Tile(hash, tile) => {
-                let added = terrain.add_tile(hash, &tile);
-                match added.err().or_else(|| terrain.over_limit()) {
-                    None => Event::Loaded(hash),
-                    Some(why) => Event::Spoiled(hash, why),
-                }
-            }
+            Report::Tile(hash, tile) => self.add_tile(hash, &tile),
             Report::Done(mut done, mut worked) => {
                 let threads = self.site.pool.current_num_threads().max(1) as u32;
                 worked.coreless /= threads;
@@ -368,6 +442,15 @@ impl<'a, C: Caster> Shift<'a, C> {
         }
     }
 
+    fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Event {
+        let terrain = &mut self.site.terrain;
+        let added = terrain.add_tile(hash, tile);
+        match added.err().or_else(|| terrain.over_limit()) {
+            None => Event::Loaded(hash),
+            Some(why) => Event::Spoiled(hash, why),
+        }
+    }
+
     fn stop_current(&mut self) {
         if let Some((_, stop)) = &self.current {
             stop.store(true, Ordering::Relaxed);
@@ -380,13 +463,31 @@ impl<'a, C: Caster> Shift<'a, C> {
         run: impl FnOnce() -> Report<C> + Send + 'static,
         panicked: impl FnOnce(String) -> Report<C> + Send + 'static,
     ) {
-        let reports = self.reports.clone();
-        self.site.pool.spawn(move || {
-            let report = catch_unwind(AssertUnwindSafe(run));
-            let report = report.unwrap_or_else(|panic| panicked(said(&*panic).to_owned()));
-            // Nobody listens once the connection is lost.
-            let _unheard = reports.blocking_send(report);
-        });
+        self.site.pool.spawn(reporting(self.reports.clone(), run, panicked));
+    }
+
+    /// The same beside the pool, for what is done before its turn: behind the pieces of a
+    /// job it would wait for the end of the job. A few of these run at once at most.
+    fn spawn_early(
+        &self,
+        run: impl FnOnce() -> Report<C> + Send + 'static,
+        panicked: impl FnOnce(String) -> Report<C> + Send + 'static,
+    ) {
+        tokio::task::spawn_blocking(reporting(self.reports.clone(), run, panicked));
+    }
+}
+
+/// Does something and reports what came of it, or its panic.
+fn reporting<C: Caster>(
+    reports: mpsc::Sender<Report<C>>,
+    run: impl FnOnce() -> Report<C>,
+    panicked: impl FnOnce(String) -> Report<C>,
+) -> impl FnOnce() {
+    move || {
+        let report = catch_unwind(AssertUnwindSafe(run));
+        let report = report.unwrap_or_else(|panic| panicked(said(&*panic).to_owned()));
+        // Nobody listens once the connection is lost.
+        let _unheard = reports.blocking_send(report);
     }
 }
 
@@ -404,6 +505,22 @@ fn counted<T>(into_ns: &AtomicU64, call: impl FnOnce() -> T) -> T {
     let result = call();
     into_ns.fetch_add(began.elapsed().as_nanos() as u64, Ordering::Relaxed);
     result
+}
+
+/// Keeps a blob on disk, if there is a cache.
+fn keep(cache: Option<&BlobCache>, hash: &BlobHash, bytes: &[u8]) {
+    if let Some(Err(error)) = cache.map(|cache| cache.put(hash, bytes)) {
+        warn!(%error, "a terrain blob was not kept");
+    }
+}
+
+/// A tile before its turn; anything else is left where it is.
+fn early<C: Caster>(hash: BlobHash, bytes: &[u8]) -> Report<C> {
+    match codec::decode(bytes) {
+        Ok(tile) => Report::Early(hash, Some(tile)),
+        Err(CodecError::NotATile) => Report::Early(hash, None),
+        Err(error) => Report::Spoiled(hash, error.to_string()),
+    }
 }
 
 /// A blob says itself whether it is a tile; what is none should be an index.

@@ -113,6 +113,13 @@ impl BlobCache {
         Some(bytes)
     }
 
+    /// Whether a blob is here, as far as one can tell without reading it. It counts as used.
+    pub fn holds(&self, hash: &BlobHash) -> bool {
+        let path = self.path_of(hash);
+        let there = fs::metadata(&path).is_ok_and(|there| there.is_file());
+        there && touch(&path, self.next_use()).is_ok()
+    }
+
     /// Keeps a blob, removing those unused longest if space is needed. One that is larger
     /// than the limit is not kept, which is no error.
     ///
