@@ -11,14 +11,22 @@ use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
 use terrafarm_terrain::store::hash_of;
+use terrafarm_common::id::FrameIndex;
 use terrafarm_wire::limits::clip_reason;
 use terrafarm_wire::message::{
-    Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
+    Ahead, Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
     Progress, Rejected, Revoke, ShotFailed, Timesheet, WantBlobs,
 };
 
 /// Shortest time between two progress messages of a shot, microseconds.
 const PROGRESS_US: u64 = 200_000;
+
+/// Cameras that a worker is told ahead, and after how many of them it is told anew.
+const AHEAD_CAMERAS: usize = 32;
+const AHEAD_REFRESH: u32 = AHEAD_CAMERAS as u32 / 2;
+/// Frames from one of them to the next: at least, and at most. The more workers there are,
+/// the less each renders of a frame, and the less it should look ahead.
+const AHEAD_STRIDE: [u32; 2] = [8, 64];
 
 /// Who a message is from or for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -81,6 +89,8 @@ struct WorkerState {
     greeting: Greeting,
     /// Shots it has been told of.
     opened: BTreeSet<ShotId>,
+    /// At which frame of a shot it is to be told anew what lies ahead.
+    ahead: BTreeMap<ShotId, FrameIndex>,
     leases: BTreeSet<LeaseId>,
 }
 
@@ -127,8 +137,12 @@ impl Farm {
             PeerEvent::Joined(greeting) => {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
-                let state =
-                    WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
+                let state = WorkerState {
+                    greeting,
+                    opened: BTreeSet::new(),
+                    ahead: BTreeMap::new(),
+                    leases: BTreeSet::new(),
+                };
                 self.workers.insert(worker, state);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
             }
@@ -453,6 +467,27 @@ impl Farm {
             self.send(Peer::Worker(worker), open);
         }
         self.send(Peer::Worker(worker), Grant { lease, shot, frame, region, camera });
+        self.tell_ahead(worker, shot, frame);
+    }
+
+    /// Tells a worker that has come to a frame where the camera will be, now and then.
+    fn tell_ahead(&mut self, worker: WorkerId, shot: ShotId, frame: FrameIndex) {
+        let [least, most] = AHEAD_STRIDE;
+        let stride = (self.workers.len() as u32 / 2).clamp(least, most);
+        let (Some(state), Some(told)) = (self.workers.get_mut(&worker), self.shots.get(shot))
+        else {
+            return;
+        };
+        if state.ahead.get(&shot).is_some_and(|&due| frame < due) {
+            return;
+        }
+        state.ahead.insert(shot, frame.saturating_add(stride * AHEAD_REFRESH));
+        let first = frame.saturating_add(stride);
+        let frames = told.cameras.iter().skip(first as usize).step_by(stride as usize);
+        let cameras: Vec<_> = frames.take(AHEAD_CAMERAS).copied().collect();
+        if !cameras.is_empty() {
+            self.send(Peer::Worker(worker), Ahead { shot, first, stride, cameras });
+        }
     }
 
     fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {
@@ -504,7 +539,10 @@ impl Farm {
         let told: Vec<_> = self
             .workers
             .iter_mut()
-            .filter_map(|(worker, state)| state.opened.remove(&shot).then_some(*worker))
+            .filter_map(|(worker, state)| {
+                state.ahead.remove(&shot);
+                state.opened.remove(&shot).then_some(*worker)
+            })
             .collect();
         for worker in told {
             self.send(Peer::Worker(worker), CloseShot { shot });

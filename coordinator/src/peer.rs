@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
 use terrafarm_wire::link::{self, HandshakeError, LinkError, Trust, handshake};
-use terrafarm_wire::message::{Message, Role};
+use terrafarm_wire::message::{Message, Refusal, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_util::sync::CancellationToken;
@@ -82,6 +82,10 @@ pub async fn serve(
             return;
         }
     };
+    if matches!(greeted.hello().role, Role::Peer) {
+        let text = "a coordinator serves workers and clients; a peer asks workers";
+        return greeted.refuse(Refusal::Malformed, text).await;
+    }
     let id = admission.last_id.fetch_add(1, Ordering::Relaxed) + 1;
     let welcomed = greeted.welcome(id, &admission.name, admission.heartbeat, admission.silence);
     let (connection, hello) = match welcomed.await {
@@ -93,7 +97,7 @@ pub async fn serve(
     };
     let (is_worker, threads) = match hello.role {
         Role::Worker { threads, .. } => (true, threads),
-        Role::Client => (false, 0),
+        Role::Client | Role::Peer => (false, 0),
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();

@@ -299,3 +299,39 @@ fn cameras_that_do_not_fit_reject_the_shot() {
         bench.say(Peer::Client(CLIENT), Cameras { number: 7, first: 0, cameras: vec![camera] });
     assert!(matches!(&out[..], [Out::Send(_, Message::Rejected(_))]), "{out:?}");
 }
+
+#[test]
+fn workers_are_told_where_the_camera_will_be_now_and_then() {
+    let mut bench = Bench::new();
+    bench.submit(600);
+    let mut told = Vec::new();
+    let mut out = bench.join(worker(1), 4);
+    while !out.is_empty() {
+        let mut next = Vec::new();
+        for one in &out {
+            match one {
+                Out::Send(_, Message::Ahead(ahead)) => told.push(ahead.clone()),
+                Out::SendFrame(_, head, _) => {
+                    let frame = head.clone().with(Pixels::raw(Bytes::new()).unwrap());
+                    let taken = terrafarm_wire::message::FrameTaken {
+                        shot: frame.shot,
+                        frame: frame.frame,
+                    };
+                    next.extend(bench.say(Peer::Client(CLIENT), taken));
+                }
+                _ => {}
+            }
+        }
+        for (worker, grant) in grants(&out) {
+            let told_until = told.last().map_or(0, |ahead| {
+                ahead.first + ahead.stride * ahead.cameras.len() as u32
+            });
+            assert!(grant.frame < told_until.max(1) || told_until >= 592, "{}", grant.frame);
+            next.extend(bench.say(Peer::Worker(worker), done(&grant)));
+        }
+        out = next;
+    }
+    assert!((4..=6).contains(&told.len()), "told {} times", told.len());
+    assert_eq!((told[0].first, told[0].stride, told[0].cameras.len()), (8, 8, 32));
+    assert!(told.iter().all(|ahead| ahead.first + 8 * (ahead.cameras.len() as u32 - 1) < 600));
+}
