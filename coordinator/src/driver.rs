@@ -13,7 +13,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{Outbox, Trust, is_this_pc};
+use terrafarm_wire::link::{Meter, Outbox, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -35,6 +35,9 @@ pub struct Config {
     pub name: String,
     /// Memory for terrain blobs on their way to workers, bytes.
     pub blob_memory_bytes: usize,
+    /// Bytes of terrain that may wait for links to workers before workers are sent to each
+    /// other for it.
+    pub redirect_above_bytes: u64,
     /// Most connections at once, greeting or greeted.
     pub connections_max: usize,
     /// Whom it lets in.
@@ -55,6 +58,7 @@ impl Default for Config {
         Config {
             name: "terrafarm".into(),
             blob_memory_bytes: 512 << 20,
+            redirect_above_bytes: 8 << 20,
             connections_max: 4608,
             trust: Trust::Loopback,
             strangers_max: 256,
@@ -97,9 +101,10 @@ pub async fn run(
     let (events, inbox) = mpsc::channel(EVENTS);
     let stop = CancellationToken::new();
     let tasks = TaskTracker::new();
-    let driver = tasks.spawn(drive(config.clone(), inbox, stop.clone()));
+    let unsent = Meter::default();
+    let driver = tasks.spawn(drive(config.clone(), inbox, stop.clone(), unsent.clone()));
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events);
+    let admission = Admission::new(&config, events, unsent);
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -140,10 +145,16 @@ struct Line {
     loopback: bool,
 }
 
-async fn drive(config: Config, mut inbox: mpsc::Receiver<ToDriver>, stop: CancellationToken) {
+async fn drive(
+    config: Config,
+    mut inbox: mpsc::Receiver<ToDriver>,
+    stop: CancellationToken,
+    unsent: Meter,
+) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
     let mut farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+    farm.redirect_above(config.redirect_above_bytes);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     loop {
         let due = farm.next_deadline().map(|at| epoch + Duration::from_micros(at.0));
@@ -157,6 +168,7 @@ async fn drive(config: Config, mut inbox: mpsc::Receiver<ToDriver>, stop: Cancel
                 }
                 Some(ToDriver::Event(peer, event)) => {
                     let gone = matches!(event, PeerEvent::Gone(..));
+                    farm.set_unsent(unsent.bytes());
                     farm.handle(now(), peer, event);
                     if gone {
                         lines.remove(&peer);

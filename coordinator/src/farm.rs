@@ -4,29 +4,24 @@
 //! and a time, and leaves messages in a queue; it reads no clock and knows no socket. The
 //! driver task (`driver.rs`) owns it and carries the messages.
 
-use crate::blobs::{Broker, ClientId, Order};
+mod terrain;
+
+use crate::blobs::{Broker, ClientId};
 use crate::shots::{FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
+use std::net::{IpAddr, SocketAddr};
+use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
 use terrafarm_terrain::store::hash_of;
-use terrafarm_common::id::FrameIndex;
 use terrafarm_wire::limits::clip_reason;
 use terrafarm_wire::message::{
-    Ahead, Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
-    Progress, Rejected, Revoke, ShotFailed, Timesheet, WantBlobs,
+    CloseShot, Done, FrameFailed, Goodbye, Grant, Message, OpenShot, Ping, Pong, Progress,
+    Rejected, Revoke, ShotFailed, Timesheet,
 };
 
 /// Shortest time between two progress messages of a shot, microseconds.
 const PROGRESS_US: u64 = 200_000;
-
-/// Cameras that a worker is told ahead, and after how many of them it is told anew.
-const AHEAD_CAMERAS: usize = 32;
-const AHEAD_REFRESH: u32 = AHEAD_CAMERAS as u32 / 2;
-/// Frames from one of them to the next: at least, and at most. The more workers there are,
-/// the less each renders of a frame, and the less it should look ahead.
-const AHEAD_STRIDE: [u32; 2] = [8, 64];
 
 /// Who a message is from or for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -56,6 +51,8 @@ pub struct Greeting {
     pub name: String,
     /// Render threads; 0 for a client.
     pub threads: u32,
+    /// Where it connects from; `None` inside this process.
+    pub address: Option<IpAddr>,
 }
 
 /// Something to be done by the driver.
@@ -82,6 +79,10 @@ pub struct Farm {
     granted: BTreeMap<LeaseId, Granted>,
     out: VecDeque<Out>,
     pings: u64,
+    /// Bytes of terrain that wait for links to workers, and from how many on workers are sent
+    /// to each other.
+    unsent_bytes: u64,
+    redirect_above_bytes: u64,
 }
 
 #[derive(Debug)]
@@ -91,6 +92,8 @@ struct WorkerState {
     opened: BTreeSet<ShotId>,
     /// At which frame of a shot it is to be told anew what lies ahead.
     ahead: BTreeMap<ShotId, FrameIndex>,
+    /// Where it gives blobs to others.
+    shelf: Option<SocketAddr>,
     leases: BTreeSet<LeaseId>,
 }
 
@@ -106,7 +109,20 @@ impl Farm {
             granted: BTreeMap::new(),
             out: VecDeque::new(),
             pings: 0,
+            unsent_bytes: 0,
+            redirect_above_bytes: u64::MAX,
         }
+    }
+
+    /// Sends workers to each other for terrain when more than so many bytes of it wait for
+    /// links. It never does unless this is called.
+    pub fn redirect_above(&mut self, bytes: u64) {
+        self.redirect_above_bytes = bytes;
+    }
+
+    /// So many bytes wait for links to workers now.
+    pub fn set_unsent(&mut self, bytes: u64) {
+        self.unsent_bytes = bytes;
     }
 
     /// What to do next; `None` when all is said. Call until then after every other call.
@@ -141,6 +157,7 @@ impl Farm {
                     greeting,
                     opened: BTreeSet::new(),
                     ahead: BTreeMap::new(),
+                    shelf: None,
                     leases: BTreeSet::new(),
                 };
                 self.workers.insert(worker, state);
@@ -189,6 +206,7 @@ impl Farm {
                 self.schedule(now, Event::HandedBack { worker, leases: back.leases });
             }
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
+            Message::Sharing(sharing) => self.shares(worker, sharing.port),
             Message::Goodbye(goodbye) => {
                 tracing::debug!(%worker, "says goodbye: {}", goodbye.reason);
             }
@@ -274,40 +292,6 @@ impl Farm {
             }
             Message::Goodbye(_) => {}
             other => self.misbehaved(now, Peer::Client(client), &other),
-        }
-    }
-
-    fn want_blobs(&mut self, worker: WorkerId, want: &WantBlobs) {
-        let opened = self.workers.get(&worker).map(|state| &state.opened);
-        let owners: BTreeSet<_> = opened
-            .into_iter()
-            .flatten()
-            .filter_map(|shot| self.shots.get(*shot).map(|shot| shot.client))
-            .collect();
-        let owners: Vec<_> = owners.into_iter().collect();
-        let orders =
-            want.hashes.iter().filter_map(|&hash| self.broker.wanted(worker, hash, &owners));
-        let orders = orders.collect();
-        self.carry_out(orders);
-    }
-
-    /// Carries out the broker's orders; questions to one client become one message.
-    fn carry_out(&mut self, orders: Vec<Order>) {
-        let mut asks: BTreeMap<ClientId, Vec<_>> = BTreeMap::new();
-        for order in orders {
-            match order {
-                Order::Deliver(worker, hash, bytes) => {
-                    self.send(Peer::Worker(worker), Blob { hash, bytes });
-                }
-                Order::Refuse(worker, hash, why) => {
-                    let why = clip_reason(&why);
-                    self.send(Peer::Worker(worker), NoBlob { hash, why });
-                }
-                Order::Ask(client, hash) => asks.entry(client).or_default().push(hash),
-            }
-        }
-        for (client, hashes) in asks {
-            self.send(Peer::Client(client), WantBlobs { hashes, elsewhere: false });
         }
     }
 
@@ -468,26 +452,6 @@ impl Farm {
         }
         self.send(Peer::Worker(worker), Grant { lease, shot, frame, region, camera });
         self.tell_ahead(worker, shot, frame);
-    }
-
-    /// Tells a worker that has come to a frame where the camera will be, now and then.
-    fn tell_ahead(&mut self, worker: WorkerId, shot: ShotId, frame: FrameIndex) {
-        let [least, most] = AHEAD_STRIDE;
-        let stride = (self.workers.len() as u32 / 2).clamp(least, most);
-        let (Some(state), Some(told)) = (self.workers.get_mut(&worker), self.shots.get(shot))
-        else {
-            return;
-        };
-        if state.ahead.get(&shot).is_some_and(|&due| frame < due) {
-            return;
-        }
-        state.ahead.insert(shot, frame.saturating_add(stride * AHEAD_REFRESH));
-        let first = frame.saturating_add(stride);
-        let frames = told.cameras.iter().skip(first as usize).step_by(stride as usize);
-        let cameras: Vec<_> = frames.take(AHEAD_CAMERAS).copied().collect();
-        if !cameras.is_empty() {
-            self.send(Peer::Worker(worker), Ahead { shot, first, stride, cameras });
-        }
     }
 
     fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {

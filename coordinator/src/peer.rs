@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, HandshakeError, LinkError, Trust, handshake};
+use terrafarm_wire::link::{self, HandshakeError, LinkError, Meter, Trust, handshake};
 use terrafarm_wire::message::{Message, Refusal, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
@@ -34,6 +34,8 @@ pub struct Admission {
     strangers: Arc<Strangers>,
     last_id: Arc<AtomicU64>,
     events: mpsc::Sender<ToDriver>,
+    /// Of what waits for links to workers.
+    unsent: Meter,
 }
 
 /// What the driver has to know of a peer.
@@ -46,7 +48,7 @@ pub struct PeerTraits {
 
 impl Admission {
     /// Lets in as many peers as the configuration says.
-    pub fn new(config: &Config, events: mpsc::Sender<ToDriver>) -> Self {
+    pub fn new(config: &Config, events: mpsc::Sender<ToDriver>, unsent: Meter) -> Self {
         Admission {
             name: config.name.as_str().into(),
             greeting_limit: config.greeting_limit,
@@ -57,6 +59,7 @@ impl Admission {
             strangers: Arc::new(Strangers::new(config.strangers_max)),
             last_id: Arc::default(),
             events,
+            unsent,
         }
     }
 
@@ -101,11 +104,12 @@ pub async fn serve(
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();
-    let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
+    let meter = if is_worker { admission.unsent.clone() } else { Meter::default() };
+    let (outbox, queues) = link::metered(URGENT_QUEUE, BULK_QUEUE, meter);
     let hang_up = CancellationToken::new();
     let writing = tokio::spawn(writer.run(queues));
     let traits = PeerTraits {
-        greeting: Greeting { name: hello.name, threads },
+        greeting: Greeting { name: hello.name, threads, address: Some(address.ip()) },
         loopback: link::is_this_pc(address.ip()),
     };
     if admission.events.send(ToDriver::Open(peer, outbox, hang_up.clone(), traits)).await.is_err() {

@@ -3,7 +3,8 @@
 //! [`run`] is the whole of it. Read in this order: [`session`] decides what to do about
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
-//! the session asks for over one connection; `backoff` says when to try again, `clock` where the
+//! the session asks for over one connection; `share` passes terrain from worker to worker;
+//! `backoff` says when to try again, `clock` where the
 //! time goes. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
@@ -16,6 +17,7 @@ mod backoff;
 mod clock;
 pub mod render;
 pub mod session;
+mod share;
 mod shift;
 pub mod sleeper;
 pub mod terrain;
@@ -24,6 +26,7 @@ pub use backoff::Reconnect;
 pub use render::{Caster, RayCaster};
 
 use backoff::Backoff;
+use share::{Others, Shelf};
 use shift::{Shift, Site};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -59,11 +62,27 @@ pub struct WorkerConfig {
     /// Memory for decoded terrain, bytes. A height tile takes 0.4 MB, a photo tile 0.5 MB;
     /// a job whose own tiles take more fails.
     pub memory_limit_bytes: u64,
+    /// Whether other workers of the farm are given tiles of the cache folder.
+    pub share: Share,
     /// What to do when there is no connection.
     pub reconnect: Reconnect,
     /// A number of this process: the worker's incarnation and the seed of its back-off.
     /// Two workers should have different ones.
     pub seed: u64,
+}
+
+/// Whether a worker gives its tiles to others of its farm, which spares the coordinator's
+/// link. It listens on the address that it reaches the coordinator from, for those whom
+/// [`WorkerConfig::trust`] lets in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Share {
+    /// It does not listen.
+    Never,
+    /// At a free port, unless the coordinator is on this PC: then there is no link to spare.
+    #[default]
+    Beyond,
+    /// At this port wherever the coordinator is; 0 is a free one.
+    At(u16),
 }
 
 /// Why a worker has ended without an error.
@@ -151,10 +170,11 @@ async fn work<C: Caster>(
     loop {
         let why = match connect(&config, &stop).await {
             Ok(None) => return Ok(Ended::Stopped),
-            Ok(Some((connection, welcome, peer))) => {
+            Ok(Some((connection, welcome, [own, peer]))) => {
                 info!(coordinator = welcome.coordinator, peer = %peer, "connected");
                 backoff.reset();
                 welcomed = true;
+                share(&config, &mut site, own, peer).await;
                 let shift = Shift::new(&mut site, !is_this_pc(peer.ip()), &welcome);
                 match shift.work(connection, &stop).await {
                     Ok(()) if stop.is_cancelled() => return Ok(Ended::Stopped),
@@ -214,10 +234,41 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
         }
     };
     let terrain = terrain::Terrain::new(config.memory_limit_bytes);
-    Ok(Site { pool, cache, terrain, caster: Arc::new(caster) })
+    let others = Arc::new(Others::new(config.trust.clone(), &config.name));
+    Ok(Site { pool, cache, terrain, caster: Arc::new(caster), shelf: None, others })
 }
 
-type Connected = (Connection<TcpStream>, Welcome, SocketAddr);
+/// Opens the shelf for other workers on the address `own` that the coordinator, `peer`, is
+/// reached from, unless it is open there already. Without one the worker works as well.
+async fn share<C: Caster>(
+    config: &WorkerConfig,
+    site: &mut Site<C>,
+    own: SocketAddr,
+    peer: SocketAddr,
+) {
+    let port = match config.share {
+        Share::Never => return,
+        Share::Beyond if is_this_pc(peer.ip()) => return,
+        Share::Beyond => 0,
+        Share::At(port) => port,
+    };
+    let Some(cache) = site.cache.clone() else { return };
+    if site.shelf.as_ref().is_some_and(|shelf| shelf.address().ip() == own.ip()) {
+        return;
+    }
+    site.shelf = None;
+    let address = SocketAddr::new(own.ip(), port);
+    match Shelf::open(address, cache, config.trust.clone(), &config.name).await {
+        Ok(shelf) => {
+            info!(address = %shelf.address(), "gives terrain to other workers");
+            site.shelf = Some(shelf);
+        }
+        Err(error) => warn!(%address, %error, "cannot give terrain to other workers"),
+    }
+}
+
+/// A connection, what the coordinator said, and the addresses of both ends, ours first.
+type Connected = (Connection<TcpStream>, Welcome, [SocketAddr; 2]);
 
 /// A greeted connection; `None` if the worker is told to stop meanwhile.
 async fn connect(
@@ -229,6 +280,7 @@ async fn connect(
         let stream = connecting.await.map_err(|_| HandshakeError::TimedOut(CONNECT_LIMIT))?;
         let stream = stream.map_err(terrafarm_wire::link::LinkError::Io)?;
         let peer = stream.peer_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
+        let own = stream.local_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
         // Small messages must not wait for others to fill a packet.
         if let Err(error) = stream.set_nodelay(true) {
             warn!(%error, "the connection stays slow for small messages");
@@ -238,7 +290,7 @@ async fn connect(
         let hello = Hello::new(&config.name, role);
         let token = config.trust.token_for(peer.ip())?;
         let (connection, welcome) = greet(stream, token, hello, CONNECT_LIMIT).await?;
-        Ok((connection, welcome, peer))
+        Ok((connection, welcome, [own, peer]))
     };
     tokio::select! {
         connected = attempt => connected.map(Some),

@@ -8,6 +8,7 @@
 use crate::clock::{TaskClock, Worked};
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
 use crate::session::{Action, Doing, Event, Glance, Session};
+use crate::share::{Others, Shelf};
 use crate::terrain::Terrain;
 use rayon::ThreadPool;
 use std::collections::VecDeque;
@@ -25,7 +26,7 @@ use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
 use terrafarm_wire::message::{
-    Blob, Done, Grant, OpenShot, Pong, RenderReport, Timesheet, Welcome,
+    Blob, Done, Elsewhere, Grant, OpenShot, Pong, RenderReport, Sharing, Timesheet, Welcome,
 };
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -46,6 +47,9 @@ pub(crate) struct Site<C: Caster> {
     pub cache: Option<Arc<BlobCache>>,
     pub terrain: Terrain<C::Prepared>,
     pub caster: Arc<C>,
+    /// Where others may ask for its blobs, if they may.
+    pub shelf: Option<Shelf>,
+    pub others: Arc<Others>,
 }
 
 /// What the thread pool has done.
@@ -57,6 +61,8 @@ enum Report<C: Caster> {
     Tile(BlobHash, Tile),
     /// A tile before its turn, or what is on disk until then.
     Early(BlobHash, Option<Tile>),
+    Fetched(Blob),
+    Unfetched(BlobHash),
     /// The tiles of a store that a frame will need.
     Glanced(BlobHash, (ShotId, FrameIndex), Vec<TileKey>),
     Done(Box<Done>, Worked),
@@ -117,6 +123,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         let (mut reader, writer) = connection.split();
         let (outbox, queues) = outbox(URGENT_MAX, BULK_MAX);
         let mut writing = tokio::spawn(writer.run(queues));
+        if let Some(shelf) = &self.site.shelf {
+            self.backlog.push_back(Sharing { port: shelf.address().port() }.into());
+        }
         let mut asked_to_stop = false;
         while !(self.ended && self.backlog.is_empty()) {
             let waiting = self.backlog.front().cloned();
@@ -187,7 +196,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Take(blob) => self.take(blob),
                 Action::Seek(hash) => self.seek(hash),
                 Action::Stock(blob) => self.stock(blob),
-                Action::Fetch(elsewhere) => Some(Event::Unfetched(elsewhere.hash)),
+                Action::Fetch(elsewhere) => self.fetch(elsewhere),
                 Action::Glance(glance, shot) => self.glance(glance, &shot),
                 Action::Start(grant, shot) => self.start(&grant, &shot),
                 Action::Resume(lease) => self.resume(lease),
@@ -316,6 +325,20 @@ impl<'a, C: Caster> Shift<'a, C> {
         None
     }
 
+    /// Asks other workers for a blob.
+    fn fetch(&self, elsewhere: Elsewhere) -> Option<Event> {
+        let (others, reports) = (self.site.others.clone(), self.reports.clone());
+        tokio::spawn(async move {
+            let report = match others.fetch(&elsewhere).await {
+                Some(blob) => Report::Fetched(blob),
+                None => Report::Unfetched(elsewhere.hash),
+            };
+            // Nobody listens once the connection is lost.
+            let _unheard = reports.send(report).await;
+        });
+        None
+    }
+
     /// Finds out which tiles a view will need.
     fn glance(&mut self, glance: Glance, shot: &OpenShot) -> Option<Event> {
         let Some(scene) = self.site.terrain.scene(shot.index) else {
@@ -399,6 +422,8 @@ impl<'a, C: Caster> Shift<'a, C> {
                 }
                 Event::Stocked(hash)
             }
+            Report::Fetched(blob) => Event::Fetched(blob),
+            Report::Unfetched(hash) => Event::Unfetched(hash),
             Report::Glanced(store, due, keys) => {
                 Event::Glanced(terrain.foresee_tiles(store, due, &keys))
             }

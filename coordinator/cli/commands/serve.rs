@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
 use terrafarm_wire::link::{Trust, is_this_pc};
-use terrafarm_worker::{Reconnect, WorkerConfig};
+use terrafarm_worker::{Reconnect, Share, WorkerConfig};
 use tokio::net::TcpListener;
 
 const MIB: u64 = 1 << 20;
@@ -26,6 +26,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         announce(address, &trust, source.as_ref());
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
+            redirect_above_bytes: args.share_above * MIB,
             trust,
             ..Config::default()
         };
@@ -97,6 +98,11 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
         cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
+        share: match args.share_port {
+            _ if args.no_share => Share::Never,
+            Some(port) => Share::At(port),
+            None => Share::Beyond,
+        },
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
         seed: process_seed(),
     };

@@ -113,11 +113,14 @@ impl BlobCache {
         Some(bytes)
     }
 
+    /// Length of a blob that is here, bytes, as far as one can tell without reading it.
+    pub fn length(&self, hash: &BlobHash) -> Option<u64> {
+        fs::metadata(self.path_of(hash)).ok().filter(|there| there.is_file()).map(|it| it.len())
+    }
+
     /// Whether a blob is here, as far as one can tell without reading it. It counts as used.
     pub fn holds(&self, hash: &BlobHash) -> bool {
-        let path = self.path_of(hash);
-        let there = fs::metadata(&path).is_ok_and(|there| there.is_file());
-        there && touch(&path, self.next_use()).is_ok()
+        self.length(hash).is_some() && touch(&self.path_of(hash), self.next_use()).is_ok()
     }
 
     /// Keeps a blob, removing those unused longest if space is needed. One that is larger

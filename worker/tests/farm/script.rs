@@ -12,7 +12,9 @@ use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, Trust, accept};
 use terrafarm_wire::message::{Blob, Hello, NoBlob, WantBlobs};
 use terrafarm_worker::render::Scene;
-use terrafarm_worker::{Caster, Ended, RayCaster, Reconnect, WorkerConfig, WorkerError, run_with};
+use terrafarm_worker::{
+    Caster, Ended, RayCaster, Reconnect, Share, WorkerConfig, WorkerError, run_with,
+};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
@@ -53,6 +55,7 @@ impl Coordinator {
             cache_dir: cache_dir.map(Path::to_owned),
             cache_limit_bytes: 1 << 30,
             memory_limit_bytes: 1 << 30,
+            share: Share::Never,
             reconnect: Reconnect {
                 attempts: Some(3),
                 first: Duration::from_millis(1),
