@@ -257,7 +257,10 @@ mod tests {
     #[test]
     fn the_owner_is_asked_once_and_everybody_is_served() {
         let mut broker = Broker::new(1000);
-        assert_eq!(broker.wanted(WorkerId(1), hash(1), true, &[OWNER]), Some(Order::Ask(OWNER, hash(1))));
+        assert_eq!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Ask(OWNER, hash(1)))
+        );
         assert_eq!(broker.wanted(WorkerId(2), hash(1), true, &[OWNER]), None);
         let orders = broker.arrived(hash(1), blob(10));
         assert_eq!(orders.len(), 2);
@@ -276,8 +279,14 @@ mod tests {
         broker.wanted(WorkerId(1), hash(1), true, &[OWNER]);
         broker.wanted(WorkerId(1), hash(3), true, &[OWNER]);
         broker.arrived(hash(3), blob(10));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(1), true, &[OWNER]), Some(Order::Deliver { .. })));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(2), true, &[OWNER]), Some(Order::Ask(..))));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Deliver { .. })
+        ));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(2), true, &[OWNER]),
+            Some(Order::Ask(..))
+        ));
     }
 
     #[test]
@@ -295,7 +304,10 @@ mod tests {
         broker.worker_gone(WorkerId(2));
         let orders = broker.client_gone(OWNER);
         assert!(matches!(&orders[..], [Order::Refuse(WorkerId(1), h, _)] if *h == hash(1)));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(1), true, &[OWNER]), Some(Order::Ask(..))));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Ask(..))
+        ));
     }
 
     #[test]

@@ -20,7 +20,7 @@ use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Trust, accept, outbox};
 use terrafarm_wire::message::{Ahead, Blob, Grant, OpenShot, Timesheet};
-use terrafarm_worker::{Reconnect, Share, WorkerConfig, run};
+use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig, run};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
@@ -106,7 +106,7 @@ async fn fly(land: Arc<Land>, bytes_per_s: f64, told: bool, memory: u64) -> ([Ti
         cache_dir: Some(folder.path().to_owned()),
         cache_limit_bytes: 1 << 30,
         memory_limit_bytes: memory,
-        share: Share::Never,
+        share: ShareTiles::Never,
         reconnect: Reconnect::NEVER,
         seed: 1,
     };

@@ -63,7 +63,7 @@ pub struct WorkerConfig {
     /// a job whose own tiles take more fails.
     pub memory_limit_bytes: u64,
     /// Whether other workers of the farm are given tiles of the cache folder.
-    pub share: Share,
+    pub share: ShareTiles,
     /// What to do when there is no connection.
     pub reconnect: Reconnect,
     /// A number of this process: the worker's incarnation and the seed of its back-off.
@@ -75,7 +75,7 @@ pub struct WorkerConfig {
 /// link. It listens on the address that it reaches the coordinator from, for those whom
 /// [`WorkerConfig::trust`] lets in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Share {
+pub enum ShareTiles {
     /// It does not listen.
     Never,
     /// At a free port, unless the coordinator is on this PC: then there is no link to spare.
@@ -247,10 +247,10 @@ async fn share<C: Caster>(
     peer: SocketAddr,
 ) {
     let port = match config.share {
-        Share::Never => return,
-        Share::Beyond if is_this_pc(peer.ip()) => return,
-        Share::Beyond => 0,
-        Share::At(port) => port,
+        ShareTiles::Never => return,
+        ShareTiles::Beyond if is_this_pc(peer.ip()) => return,
+        ShareTiles::Beyond => 0,
+        ShareTiles::At(port) => port,
     };
     let Some(cache) = site.cache.clone() else { return };
     if site.shelf.as_ref().is_some_and(|shelf| shelf.address().ip() == own.ip()) {

@@ -57,12 +57,7 @@ pub trait Caster: Send + Sync + 'static {
 
     /// The tiles that a region of a view will probably need and that are not in memory: a
     /// guess, soon made. A caster that needs no tiles has none to name.
-    fn scout(
-        &self,
-        _scene: &Scene<Self::Prepared>,
-        _view: &View,
-        _region: Region,
-    ) -> Vec<TileKey> {
+    fn scout(&self, _scene: &Scene<Self::Prepared>, _view: &View, _region: Region) -> Vec<TileKey> {
         Vec::new()
     }
 

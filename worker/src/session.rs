@@ -28,8 +28,8 @@ pub use supply::{ASKED_MAX, EARLY_MAX, Source};
 use outlook::Outlook;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
-use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use supply::{Failure, Supply};
+use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_wire::Message;
 use terrafarm_wire::limits::{HAND_BACK_MAX, clip_reason};
 use terrafarm_wire::message::{
@@ -244,10 +244,9 @@ impl Session {
 
     fn receive(&mut self, message: Message) {
         match message {
-            Message::OpenShot(shot)
-                if self.shots.len() < SHOTS_MAX => {
-                    self.shots.insert(shot.shot, Arc::new(shot));
-                }
+            Message::OpenShot(shot) if self.shots.len() < SHOTS_MAX => {
+                self.shots.insert(shot.shot, Arc::new(shot));
+            }
             Message::Grant(grant) => self.granted(grant),
             Message::Revoke(revoke) => self.revoke(revoke.lease),
             Message::CloseShot(close) => self.close(close.shot),

@@ -127,7 +127,8 @@ impl House {
         let token = self.trust.token_for(guest)?;
         let greeting = accept(stream, token, &program(), GREETING_LIMIT).await?;
         if greeting.hello().role != Role::Peer {
-            let text = "this is a worker, which gives terrain to other workers; name the coordinator";
+            let text =
+                "this is a worker, which gives terrain to other workers; name the coordinator";
             greeting.refuse(Refusal::Malformed, text).await;
             return Ok(());
         }
@@ -217,12 +218,7 @@ enum Ungiven {
 impl Others {
     /// Knows nobody yet.
     pub fn new(trust: Trust, name: &str) -> Others {
-        Others {
-            trust,
-            name: name.to_owned(),
-            known: Mutex::default(),
-            damaged: AtomicU64::new(0),
-        }
+        Others { trust, name: name.to_owned(), known: Mutex::default(), damaged: AtomicU64::new(0) }
     }
 
     /// A blob whose hash is right, from the first that gives it.

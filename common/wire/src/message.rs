@@ -20,7 +20,8 @@ pub use shot::{
     ShotFailed, Submit, WorkerShare,
 };
 pub use work::{
-    Ahead, CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Timesheet,
+    Ahead, CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke,
+    Timesheet,
 };
 
 use crate::limits::{Class, NAME_BYTES_MAX, REASON_BYTES_MAX};

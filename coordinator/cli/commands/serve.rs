@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::Config;
 use terrafarm_wire::link::{Trust, is_this_pc};
-use terrafarm_worker::{Reconnect, Share, WorkerConfig};
+use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig};
 use tokio::net::TcpListener;
 
 const MIB: u64 = 1 << 20;
@@ -99,9 +99,9 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
         share: match args.share_port {
-            _ if args.no_share => Share::Never,
-            Some(port) => Share::At(port),
-            None => Share::Beyond,
+            _ if args.no_share => ShareTiles::Never,
+            Some(port) => ShareTiles::At(port),
+            None => ShareTiles::Beyond,
         },
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
         seed: process_seed(),

@@ -69,10 +69,8 @@ impl Farm {
             !is_this_pc(shelf.ip()) || own.is_some_and(is_this_pc)
         };
         let holders = self.broker.holders(hash).iter().filter(|holder| **holder != worker);
-        let mut shelves: Vec<_> = holders
-            .filter_map(|holder| self.workers.get(holder)?.shelf)
-            .filter(reaches)
-            .collect();
+        let mut shelves: Vec<_> =
+            holders.filter_map(|holder| self.workers.get(holder)?.shelf).filter(reaches).collect();
         if shelves.is_empty() {
             return false;
         }

@@ -38,7 +38,14 @@ impl Bench {
     }
 
     fn join(&mut self, peer: Peer, threads: u32) -> Vec<Out> {
-        self.event(peer, PeerEvent::Joined(Greeting { name: format!("{peer:?}"), threads, address: Some([127, 0, 0, 1].into()) }))
+        self.event(
+            peer,
+            PeerEvent::Joined(Greeting {
+                name: format!("{peer:?}"),
+                threads,
+                address: Some([127, 0, 0, 1].into()),
+            }),
+        )
     }
 
     fn gone(&mut self, peer: Peer) -> Vec<Out> {
@@ -323,9 +330,9 @@ fn workers_are_told_where_the_camera_will_be_now_and_then() {
             }
         }
         for (worker, grant) in grants(&out) {
-            let told_until = told.last().map_or(0, |ahead| {
-                ahead.first + ahead.stride * ahead.cameras.len() as u32
-            });
+            let told_until = told
+                .last()
+                .map_or(0, |ahead| ahead.first + ahead.stride * ahead.cameras.len() as u32);
             assert!(grant.frame < told_until.max(1) || told_until >= 592, "{}", grant.frame);
             next.extend(bench.say(Peer::Worker(worker), done(&grant)));
         }

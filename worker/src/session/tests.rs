@@ -371,7 +371,8 @@ impl World {
             assert!(!self.ended, "{action:?} after the end");
             match action {
                 Action::Send(message) => {
-                    if let (Message::WantBlobs(want), Doing::Waiting) = (&message, session.doing()) {
+                    if let (Message::WantBlobs(want), Doing::Waiting) = (&message, session.doing())
+                    {
                         let needed = |hash| self.needs.contains(hash) || *hash == INDEX;
                         assert!(want.hashes.iter().all(needed), "for later while a job waits");
                     }

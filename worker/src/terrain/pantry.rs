@@ -130,8 +130,11 @@ impl Pantry {
     }
 
     fn extract(&mut self, which: impl Fn(&Stowed) -> bool) -> Vec<Stowed> {
-        let taken: Vec<_> =
-            self.stowed.extract_if(.., |_, stowed| which(stowed)).map(|(_, stowed)| stowed).collect();
+        let taken: Vec<_> = self
+            .stowed
+            .extract_if(.., |_, stowed| which(stowed))
+            .map(|(_, stowed)| stowed)
+            .collect();
         self.bytes -= taken.iter().map(|stowed| stowed.tile.memory_bytes() as u64).sum::<u64>();
         taken
     }

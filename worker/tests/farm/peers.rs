@@ -2,13 +2,13 @@ use crate::scene::{Terrain, grant, whole};
 use crate::script::{Coordinator, PATIENCE, Peer, start};
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
-use terrafarm_common::id::BlobHash;
+use terrafarm_common::id::{BlobHash, LeaseId};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{FarmToken, HandshakeError, Trust, accept, greet};
 use terrafarm_wire::message::{
     Ahead, Blob, Done, Elsewhere, Grant, Hello, NoBlob, Role, Sharing, WantBlobs,
 };
-use terrafarm_worker::Share;
+use terrafarm_worker::ShareTiles;
 use tokio::net::{TcpListener, TcpStream};
 
 /// The port of a worker that has just said that it shares.
@@ -46,7 +46,7 @@ async fn serve(
     }
 }
 
-fn check(done: &Done, terrain: &Terrain, job: &Grant) {
+fn check(done: Done, terrain: &Terrain, job: &Grant) {
     let pixels = done.pixels.unpack(whole().area() as usize * 3).unwrap();
     assert!(pixels == terrain.expected(job, 1));
 }
@@ -59,7 +59,7 @@ async fn a_worker_gets_all_of_its_terrain_from_another_one() {
     let token = FarmToken::from_bytes([7; 32]);
     let configs = folders.each_ref().map(|folder| {
         let mut config = coordinator.config(Some(folder.path()));
-        config.share = Share::At(0);
+        config.share = ShareTiles::At(0);
         config.trust = Trust::Token(token.clone());
         config
     });
@@ -79,7 +79,7 @@ async fn a_worker_gets_all_of_its_terrain_from_another_one() {
     other.send(terrain.open(1, 1)).await;
     other.send(job).await;
     let (done, given) = serve(&mut other, &terrain, &[address]).await;
-    check(&done, &terrain, &job);
+    check(done, &terrain, &job);
     assert!(asked >= 2 && given.is_empty(), "{} of {asked} by the coordinator", given.len());
 
     // Strangers, and those who are no peers, get nothing.
@@ -149,7 +149,6 @@ async fn bad_worker(fault: Fault) -> SocketAddr {
 #[tokio::test]
 async fn workers_that_die_lie_or_stall_do_no_harm() {
     let terrain = Terrain::new();
-    let coordinator = Coordinator::new().await;
     let job = grant(1, 1, whole());
     let nobody = {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -168,12 +167,13 @@ async fn workers_that_die_lie_or_stall_do_no_harm() {
     }
     for addresses in bad.chunks(2) {
         let folder = tempfile::tempdir().unwrap();
+        let coordinator = Coordinator::new().await;
         let _running = start(coordinator.config(Some(folder.path())));
         let mut peer = coordinator.welcome().await;
         peer.send(terrain.open(1, 1)).await;
         peer.send(job).await;
         let (done, given) = serve(&mut peer, &terrain, addresses).await;
-        check(&done, &terrain, &job);
+        check(done, &terrain, &job);
         assert!(given.len() >= 2, "all of it from the coordinator in the end");
     }
 }
@@ -181,35 +181,45 @@ async fn workers_that_die_lie_or_stall_do_no_harm() {
 #[tokio::test]
 async fn the_tiles_of_the_way_ahead_are_there_before_a_job_asks() {
     let terrain = Terrain::new();
-    let folder = tempfile::tempdir().unwrap();
-    let coordinator = Coordinator::new().await;
-    let _running = start(coordinator.config(Some(folder.path())));
-    let mut peer = coordinator.welcome().await;
-    peer.send(terrain.open(1, 1)).await;
-    // The first job looks at the sky; the way ahead is down on the ground.
     let job = grant(2, 1, whole());
-    let mut sky = job;
-    sky.lease = terrafarm_common::id::LeaseId(1);
-    (sky.camera.forward, sky.camera.up) = (job.camera.up, -job.camera.forward);
-    peer.send(sky).await;
-    assert!(matches!(peer.serve(&terrain).await, Some(Message::Done(_))));
-    let before = peer.asked.len();
-    let ahead = Ahead { shot: job.shot, first: 8, stride: 8, cameras: vec![job.camera] };
-    peer.send(ahead).await;
-    // Every tile of the store that is there is asked for, without a job.
-    let tiles = terrain.blobs.len() - 1;
-    let mut asked = BTreeSet::new();
-    while asked.len() + before < 1 + tiles.min(4) {
-        let Some(Message::WantBlobs(want)) = peer.recv().await else { panic!("no question") };
-        for hash in want.hashes {
-            asked.insert(hash);
-            let bytes = terrain.blobs[&hash].clone().into();
-            peer.send(Blob { hash, bytes }).await;
+    // What the job asks for if nothing was fetched before.
+    let mut needed: BTreeSet<_> = {
+        let coordinator = Coordinator::new().await;
+        let _running = start(coordinator.config(None));
+        let mut peer = coordinator.welcome().await;
+        peer.send(terrain.open(1, 1)).await;
+        peer.send(job).await;
+        assert!(matches!(peer.serve(&terrain).await, Some(Message::Done(_))));
+        peer.asked.into_iter().collect()
+    };
+    for on_disk in [true, false] {
+        let folder = tempfile::tempdir().unwrap();
+        let coordinator = Coordinator::new().await;
+        let _running = start(coordinator.config(on_disk.then(|| folder.path())));
+        let mut peer = coordinator.welcome().await;
+        peer.send(terrain.open(1, 1)).await;
+        // The first job looks at the sky, the way ahead lies on the ground.
+        let mut sky = Grant { lease: LeaseId(1), ..job };
+        (sky.camera.forward, sky.camera.up) = (job.camera.up, -job.camera.forward);
+        peer.send(sky).await;
+        assert!(matches!(peer.serve(&terrain).await, Some(Message::Done(_))));
+        needed.retain(|hash| !peer.asked.contains(hash));
+        assert!(!needed.is_empty());
+        let ahead = Ahead { shot: job.shot, first: 8, stride: 8, cameras: vec![job.camera] };
+        peer.send(ahead).await;
+        let mut fetched = BTreeSet::new();
+        while !needed.is_subset(&fetched) {
+            let Some(Message::WantBlobs(want)) = peer.recv().await else { panic!("no question") };
+            for hash in want.hashes {
+                assert!(fetched.insert(hash), "asked twice");
+                let bytes = terrain.blobs[&hash].clone().into();
+                peer.send(Blob { hash, bytes }).await;
+            }
         }
+        peer.asked.clear();
+        peer.send(job).await;
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        check(done, &terrain, &job);
+        assert!(peer.asked.iter().all(|hash| !needed.contains(hash)), "all of it was there");
     }
-    peer.send(job).await;
-    peer.asked.clear();
-    let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
-    check(&done, &terrain, &job);
-    assert!(peer.asked.iter().all(|hash| !asked.contains(hash)), "asked once");
 }

@@ -320,10 +320,9 @@ pub fn any_message() -> impl Strategy<Value = Message> {
     );
     let want = (prop::collection::vec(any_hash(), 1..50), any::<bool>())
         .prop_map(|(hashes, elsewhere)| WantBlobs { hashes, elsewhere }.into());
-    let ahead = (0u32..1000, 1u32..1000, prop::collection::vec(any_camera(), 1..=64))
-        .prop_map(|(first, stride, cameras)| {
-            Ahead { shot: ShotId(7), first, stride, cameras }.into()
-        });
+    let ahead = (0u32..1000, 1u32..1000, prop::collection::vec(any_camera(), 1..=64)).prop_map(
+        |(first, stride, cameras)| Ahead { shot: ShotId(7), first, stride, cameras }.into(),
+    );
     let elsewhere = (any_hash(), prop::collection::vec(any::<std::net::SocketAddr>(), 1..=4))
         .prop_map(|(hash, mut workers)| {
             workers.iter_mut().for_each(|worker| worker.set_port(worker.port().max(1)));
