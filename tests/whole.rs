@@ -14,6 +14,10 @@ mod tidy;
 #[path = "whole/farm.rs"]
 mod farm;
 
+/// Terrain that comes from other workers, or damaged.
+#[path = "whole/terrain_on_farm.rs"]
+mod terrain_on_farm;
+
 /// Whoever has not the token, floods, dawdles or lies harms nobody who works.
 #[path = "whole/hostile.rs"]
 mod hostile;
