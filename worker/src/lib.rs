@@ -257,7 +257,8 @@ async fn share<C: Caster>(
         return;
     }
     site.shelf = None;
-    let address = SocketAddr::new(own.ip(), port);
+    let mut address = own;
+    address.set_port(port);
     match Shelf::open(address, cache, config.trust.clone(), &config.name).await {
         Ok(shelf) => {
             info!(address = %shelf.address(), "gives terrain to other workers");

@@ -79,7 +79,8 @@ impl Body for NoBlob {
 pub struct Elsewhere {
     /// What was asked for.
     pub hash: BlobHash,
-    /// Where to ask, best first: at least one, at most [`ELSEWHERE_MAX`].
+    /// Where to ask, best first: at least one, at most [`ELSEWHERE_MAX`]. The scope of an IPv6
+    /// address means nothing on another PC and does not travel.
     pub workers: Vec<SocketAddr>,
 }
 

@@ -323,11 +323,9 @@ pub fn any_message() -> impl Strategy<Value = Message> {
     let ahead = (0u32..1000, 1u32..1000, prop::collection::vec(any_camera(), 1..=64)).prop_map(
         |(first, stride, cameras)| Ahead { shot: ShotId(7), first, stride, cameras }.into(),
     );
-    let elsewhere = (any_hash(), prop::collection::vec(any::<std::net::SocketAddr>(), 1..=4))
-        .prop_map(|(hash, mut workers)| {
-            workers.iter_mut().for_each(|worker| worker.set_port(worker.port().max(1)));
-            Elsewhere { hash, workers }.into()
-        });
+    let address = (any::<std::net::IpAddr>(), 1u16..).prop_map(std::net::SocketAddr::from);
+    let elsewhere = (any_hash(), prop::collection::vec(address, 1..=4))
+        .prop_map(|(hash, workers)| Elsewhere { hash, workers }.into());
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
     let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
