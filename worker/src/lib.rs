@@ -235,7 +235,7 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     };
     let terrain = terrain::Terrain::new(config.memory_limit_bytes);
     let others = Arc::new(Others::new(config.trust.clone(), &config.name));
-    Ok(Site { pool, cache, terrain, caster: Arc::new(caster), shelf: None, others })
+    Ok(Site { pool, cache, terrain, caster: Arc::new(caster), shelf: None, others, damaged: 0 })
 }
 
 /// Opens the shelf for other workers on the address `own` that the coordinator, `peer`, is

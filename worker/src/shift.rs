@@ -5,9 +5,11 @@
 //! the thread pool, writing in a task of its own), so that a heartbeat is answered at
 //! once whatever else goes on.
 
+mod early;
+
 use crate::clock::{TaskClock, Worked};
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
-use crate::session::{Action, Doing, Event, Glance, Session};
+use crate::session::{Action, Doing, Event, Session};
 use crate::share::{Others, Shelf};
 use crate::terrain::Terrain;
 use rayon::ThreadPool;
@@ -26,7 +28,7 @@ use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
 use terrafarm_wire::message::{
-    Blob, Done, Elsewhere, Grant, OpenShot, Pong, RenderReport, Sharing, Timesheet, Welcome,
+    Blob, Done, Grant, OpenShot, Pong, RenderReport, Sharing, Timesheet, Welcome,
 };
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -50,6 +52,8 @@ pub(crate) struct Site<C: Caster> {
     /// Where others may ask for its blobs, if they may.
     pub shelf: Option<Shelf>,
     pub others: Arc<Others>,
+    /// Blobs that the coordinator sent and that were not what they should be.
+    pub damaged: u64,
 }
 
 /// What the thread pool has done.
@@ -252,7 +256,7 @@ impl<'a, C: Caster> Shift<'a, C> {
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         self.spawn(
             move || {
-                counted(&unpacking_ns, || match cache.get(&hash) {
+                counted(&unpacking_ns, || match read(&cache, &hash) {
                     Some(bytes) => decoded(&*caster, hash, &bytes),
                     None => Report::Absent(hash),
                 })
@@ -280,76 +284,6 @@ impl<'a, C: Caster> Shift<'a, C> {
                 })
             },
             move |panic| Report::Spoiled(hash, panic),
-        );
-        None
-    }
-
-    /// Looks for a blob for later.
-    fn seek(&mut self, hash: BlobHash) -> Option<Event> {
-        let room = self.site.terrain.has_room_ahead();
-        let Some(cache) = self.site.cache.clone() else {
-            return Some(if room { Event::Absent(hash) } else { Event::NoRoom(hash) });
-        };
-        self.spawn_early(
-            move || match room {
-                true => match cache.get(&hash) {
-                    Some(bytes) => early(hash, &bytes),
-                    None => Report::Absent(hash),
-                },
-                false if cache.holds(&hash) => Report::Early(hash, None),
-                false => Report::Absent(hash),
-            },
-            move |panic| Report::Spoiled(hash, panic),
-        );
-        None
-    }
-
-    /// Keeps a blob for later: in memory if there is room, and on disk.
-    fn stock(&mut self, blob: Blob) -> Option<Event> {
-        let Blob { hash, bytes } = blob;
-        let room = self.site.terrain.has_room_ahead();
-        let cache = self.site.cache.clone();
-        if !room && cache.is_none() {
-            return Some(Event::NoRoom(hash));
-        }
-        self.spawn_early(
-            move || {
-                if hash_of(&bytes) != hash {
-                    return Report::Damaged(hash);
-                }
-                keep(cache.as_deref(), &hash, &bytes);
-                if room { early(hash, &bytes) } else { Report::Early(hash, None) }
-            },
-            move |panic| Report::Spoiled(hash, panic),
-        );
-        None
-    }
-
-    /// Asks other workers for a blob.
-    fn fetch(&self, elsewhere: Elsewhere) -> Option<Event> {
-        let (others, reports) = (self.site.others.clone(), self.reports.clone());
-        tokio::spawn(async move {
-            let report = match others.fetch(&elsewhere).await {
-                Some(blob) => Report::Fetched(blob),
-                None => Report::Unfetched(elsewhere.hash),
-            };
-            // Nobody listens once the connection is lost.
-            let _unheard = reports.send(report).await;
-        });
-        None
-    }
-
-    /// Finds out which tiles a view will need.
-    fn glance(&mut self, glance: Glance, shot: &OpenShot) -> Option<Event> {
-        let Some(scene) = self.site.terrain.scene(shot.index) else {
-            return Some(Event::Glanced(Vec::new()));
-        };
-        let Glance { shot: number, due, camera, region } = glance;
-        let view = View { camera, shading: shot.shading.clone(), quality: shot.quality };
-        let (caster, store, due) = (self.site.caster.clone(), shot.index, (number, due));
-        self.spawn_early(
-            move || Report::Glanced(store, due, caster.scout(&scene, &view, region)),
-            move |_| Report::Glanced(store, due, Vec::new()),
         );
         None
     }
@@ -412,7 +346,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         match report {
             Report::Absent(hash) => Event::Absent(hash),
             Report::Damaged(hash) => {
-                warn!(%hash, "a terrain blob came damaged and is fetched again");
+                self.site.damaged += 1;
+                let damaged = self.site.damaged;
+                warn!(%hash, damaged, "a terrain blob came damaged and is fetched again");
                 Event::Damaged(hash)
             }
             Report::Early(hash, tile) => {
@@ -490,16 +426,6 @@ impl<'a, C: Caster> Shift<'a, C> {
     ) {
         self.site.pool.spawn(reporting(self.reports.clone(), run, panicked));
     }
-
-    /// The same beside the pool, for what is done before its turn: behind the pieces of a
-    /// job it would wait for the end of the job. A few of these run at once at most.
-    fn spawn_early(
-        &self,
-        run: impl FnOnce() -> Report<C> + Send + 'static,
-        panicked: impl FnOnce(String) -> Report<C> + Send + 'static,
-    ) {
-        tokio::task::spawn_blocking(reporting(self.reports.clone(), run, panicked));
-    }
 }
 
 /// Does something and reports what came of it, or its panic.
@@ -532,19 +458,21 @@ fn counted<T>(into_ns: &AtomicU64, call: impl FnOnce() -> T) -> T {
     result
 }
 
+/// A blob of the cache, if it is there and sound.
+fn read(cache: &BlobCache, hash: &BlobHash) -> Option<Vec<u8>> {
+    let before = cache.damaged();
+    let found = cache.get(hash);
+    let damaged = cache.damaged();
+    if found.is_none() && damaged > before {
+        warn!(%hash, damaged, "a terrain blob was damaged on disk and is fetched again");
+    }
+    found
+}
+
 /// Keeps a blob on disk, if there is a cache.
 fn keep(cache: Option<&BlobCache>, hash: &BlobHash, bytes: &[u8]) {
     if let Some(Err(error)) = cache.map(|cache| cache.put(hash, bytes)) {
         warn!(%error, "a terrain blob was not kept");
-    }
-}
-
-/// A tile before its turn; anything else is left where it is.
-fn early<C: Caster>(hash: BlobHash, bytes: &[u8]) -> Report<C> {
-    match codec::decode(bytes) {
-        Ok(tile) => Report::Early(hash, Some(tile)),
-        Err(CodecError::NotATile) => Report::Early(hash, None),
-        Err(error) => Report::Spoiled(hash, error.to_string()),
     }
 }
 
