@@ -22,6 +22,10 @@ mod faults;
 #[path = "whole/queue.rs"]
 mod queue;
 
+/// Terrain that comes from other workers, or damaged.
+#[path = "whole/terrain_on_farm.rs"]
+mod terrain_on_farm;
+
 /// Whoever has not the token, floods, dawdles or lies harms nobody who works.
 #[path = "whole/hostile.rs"]
 mod hostile;

@@ -357,6 +357,10 @@ pub struct Coordinator {
     /// Memory for terrain tiles on their way to workers, MiB
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
     pub blob_memory: u64,
+    /// Terrain that may wait for links to workers, MiB, before workers are sent to each other
+    /// for it
+    #[arg(long, value_name = "MIB", default_value_t = 8, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
+    pub share_above: u64,
     /// Folder for a queue of shots that outlives whoever submits them, and the coordinator
     #[arg(long, value_name = "FOLDER")]
     pub data: Option<PathBuf>,
@@ -394,6 +398,13 @@ pub struct Worker {
     /// Memory for decoded tiles, MiB
     #[arg(long, default_value_t = 1024, value_parser = clap::value_parser!(u64).range(64..=1_048_576))]
     pub memory_limit: u64,
+    /// Port at which other workers are given tiles of the cache, wherever the coordinator is;
+    /// 0 takes a free one [default: a free one, if the coordinator is on another PC]
+    #[arg(long, value_name = "PORT", conflicts_with = "no_share")]
+    pub share_port: Option<u16>,
+    /// Give no tiles to other workers
+    #[arg(long)]
+    pub no_share: bool,
     /// When to work, by this PC's clock: days, times or both, such as
     /// "mon-fri 18:00-08:00, sat, sun" [default: always]
     #[arg(long, value_name = "HOURS", env = "TERRAFARM_HOURS")]

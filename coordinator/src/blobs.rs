@@ -5,16 +5,26 @@
 //! keeps recent ones within a memory limit so that the next worker need not wait. It is a
 //! pure state machine: the driver feeds it what happened and carries out its orders.
 //!
+//! It remembers who has been given what: others can be sent there ([`Broker::holders`])
+//! where the links of the coordinator, or of the owner, are the limit.
+//!
 //! Departures from a plain LRU cache: a blob larger than the whole limit is passed on but
 //! not kept, and a blob that somebody waits for is never asked for twice.
 
 use bytes::Bytes;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use terrafarm_common::id::{BlobHash, WorkerId};
+use terrafarm_terrain::store::hash_of;
 
 /// Most blobs that may be awaited at once, for all workers together: the tiles of a few
 /// hundred cold workers.
 const AWAITED_MAX: usize = 1 << 16;
+
+/// Most blobs of which it is remembered who has them, and most workers remembered for each.
+const HELD_MAX: usize = 1 << 16;
+const HOLDERS_MAX: usize = 16;
+/// So many blobs awaited of their owners mean that owners are the limit.
+const OWNERS_BEHIND: usize = 128;
 
 /// A connection of a client, who owns terrain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -23,8 +33,8 @@ pub struct ClientId(pub u64);
 /// What the driver has to do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Order {
-    /// Send a blob to a worker.
-    Deliver(WorkerId, BlobHash, Bytes),
+    /// Send a blob to a worker; `elsewhere` if it may be sent to another worker instead.
+    Deliver { worker: WorkerId, hash: BlobHash, bytes: Bytes, elsewhere: bool },
     /// Tell a worker that nobody has the blob, and why.
     Refuse(WorkerId, BlobHash, String),
     /// Ask a client for a blob.
@@ -41,6 +51,9 @@ pub struct Broker {
     kept_bytes: usize,
     limit_bytes: usize,
     wanted: BTreeMap<BlobHash, Wanted>,
+    /// Who has been given a blob, the first one first, and when it was given last.
+    held: BTreeMap<BlobHash, (u64, Vec<WorkerId>)>,
+    held_by_age: BTreeMap<u64, BlobHash>,
 }
 
 #[derive(Debug)]
@@ -55,7 +68,8 @@ struct Wanted {
     asked: ClientId,
     /// Who may be asked after that.
     others: Vec<ClientId>,
-    workers: BTreeSet<WorkerId>,
+    /// Who waits, and whether another worker will do.
+    workers: BTreeMap<WorkerId, bool>,
 }
 
 impl Broker {
@@ -68,21 +82,29 @@ impl Broker {
             kept_bytes: 0,
             limit_bytes,
             wanted: BTreeMap::new(),
+            held: BTreeMap::new(),
+            held_by_age: BTreeMap::new(),
         }
     }
 
-    /// A worker wants a blob that one of these clients should have.
+    /// A worker wants a blob that one of these clients should have. `elsewhere` if it takes it
+    /// from other workers, too; if not, it may have been given a damaged one, so that what
+    /// is in memory is looked at again.
     pub fn wanted(
         &mut self,
         worker: WorkerId,
         hash: BlobHash,
+        elsewhere: bool,
         owners: &[ClientId],
     ) -> Option<Order> {
+        if !elsewhere {
+            self.drop_if_damaged(hash);
+        }
         if let Some(bytes) = self.touch(hash) {
-            return Some(Order::Deliver(worker, hash, bytes));
+            return Some(Order::Deliver { worker, hash, bytes, elsewhere });
         }
         if let Some(wanted) = self.wanted.get_mut(&hash) {
-            wanted.workers.insert(worker);
+            wanted.workers.insert(worker, elsewhere);
             return None;
         }
         if self.wanted.len() >= AWAITED_MAX {
@@ -91,8 +113,8 @@ impl Broker {
         let Some((&first, others)) = owners.split_first() else {
             return Some(Order::Refuse(worker, hash, "no client has this terrain".into()));
         };
-        let wanted =
-            Wanted { asked: first, others: others.to_vec(), workers: BTreeSet::from([worker]) };
+        let workers = BTreeMap::from([(worker, elsewhere)]);
+        let wanted = Wanted { asked: first, others: others.to_vec(), workers };
         self.wanted.insert(hash, wanted);
         Some(Order::Ask(first, hash))
     }
@@ -102,7 +124,10 @@ impl Broker {
     pub fn arrived(&mut self, hash: BlobHash, bytes: Bytes) -> Vec<Order> {
         let Some(wanted) = self.wanted.remove(&hash) else { return Vec::new() };
         self.keep(hash, bytes.clone());
-        let deliver = |worker| Order::Deliver(worker, hash, bytes.clone());
+        let deliver = |(worker, elsewhere)| {
+            let bytes = bytes.clone();
+            Order::Deliver { worker, hash, bytes, elsewhere }
+        };
         wanted.workers.into_iter().map(deliver).collect()
     }
 
@@ -117,7 +142,7 @@ impl Broker {
             return vec![Order::Ask(next, hash)];
         }
         let workers = self.wanted.remove(&hash).map(|wanted| wanted.workers).unwrap_or_default();
-        workers.into_iter().map(|worker| Order::Refuse(worker, hash, why.to_owned())).collect()
+        workers.into_keys().map(|worker| Order::Refuse(worker, hash, why.to_owned())).collect()
     }
 
     /// A worker is gone: nobody delivers to it any more.
@@ -143,6 +168,49 @@ impl Broker {
             self.missing(client, hash, "the client that owns the terrain went away")
         });
         orders.collect()
+    }
+
+    /// Whether a blob is neither here nor soon to come, because owners are behind.
+    pub fn owners_are_behind(&self, hash: BlobHash) -> bool {
+        self.wanted.len() >= OWNERS_BEHIND
+            && !self.kept.contains_key(&hash)
+            && !self.wanted.contains_key(&hash)
+    }
+
+    /// Workers that have been given a blob, the first one first. Some may be gone, or may have
+    /// forgotten it.
+    pub fn holders(&self, hash: BlobHash) -> &[WorkerId] {
+        self.held.get(&hash).map_or(&[], |(_, workers)| workers)
+    }
+
+    /// A worker has been given a blob, or been told where to get it.
+    pub fn given(&mut self, worker: WorkerId, hash: BlobHash) {
+        self.clock += 1;
+        let (last, workers) = self.held.entry(hash).or_default();
+        self.held_by_age.remove(last);
+        *last = self.clock;
+        self.held_by_age.insert(self.clock, hash);
+        workers.retain(|other| *other != worker);
+        if workers.len() >= HOLDERS_MAX {
+            workers.remove(0);
+        }
+        workers.push(worker);
+        if self.held.len() > HELD_MAX
+            && let Some((_, oldest)) = self.held_by_age.pop_first()
+        {
+            self.held.remove(&oldest);
+        }
+    }
+
+    /// Memory fails, too: what it changed must not be given again.
+    fn drop_if_damaged(&mut self, hash: BlobHash) {
+        if self.kept.get(&hash).is_some_and(|kept| hash_of(&kept.bytes) != hash)
+            && let Some(kept) = self.kept.remove(&hash)
+        {
+            tracing::warn!(%hash, "a terrain blob was damaged in memory and is asked for again");
+            self.by_age.remove(&kept.last_use);
+            self.kept_bytes -= kept.bytes.len();
+        }
     }
 
     fn touch(&mut self, hash: BlobHash) -> Option<Bytes> {
@@ -189,26 +257,36 @@ mod tests {
     #[test]
     fn the_owner_is_asked_once_and_everybody_is_served() {
         let mut broker = Broker::new(1000);
-        assert_eq!(broker.wanted(WorkerId(1), hash(1), &[OWNER]), Some(Order::Ask(OWNER, hash(1))));
-        assert_eq!(broker.wanted(WorkerId(2), hash(1), &[OWNER]), None);
+        assert_eq!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Ask(OWNER, hash(1)))
+        );
+        assert_eq!(broker.wanted(WorkerId(2), hash(1), true, &[OWNER]), None);
         let orders = broker.arrived(hash(1), blob(10));
         assert_eq!(orders.len(), 2);
-        let third = broker.wanted(WorkerId(3), hash(1), &[OWNER]);
-        assert_eq!(third, Some(Order::Deliver(WorkerId(3), hash(1), blob(10))));
+        let third = broker.wanted(WorkerId(3), hash(1), true, &[OWNER]);
+        let (worker, hash, bytes) = (WorkerId(3), hash(1), blob(10));
+        assert_eq!(third, Some(Order::Deliver { worker, hash, bytes, elsewhere: true }));
     }
 
     #[test]
     fn the_least_recently_used_blob_makes_room() {
         let mut broker = Broker::new(25);
         for n in 1..=2 {
-            broker.wanted(WorkerId(1), hash(n), &[OWNER]);
+            broker.wanted(WorkerId(1), hash(n), true, &[OWNER]);
             broker.arrived(hash(n), blob(10));
         }
-        broker.wanted(WorkerId(1), hash(1), &[OWNER]);
-        broker.wanted(WorkerId(1), hash(3), &[OWNER]);
+        broker.wanted(WorkerId(1), hash(1), true, &[OWNER]);
+        broker.wanted(WorkerId(1), hash(3), true, &[OWNER]);
         broker.arrived(hash(3), blob(10));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(1), &[OWNER]), Some(Order::Deliver(..))));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(2), &[OWNER]), Some(Order::Ask(..))));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Deliver { .. })
+        ));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(2), true, &[OWNER]),
+            Some(Order::Ask(..))
+        ));
     }
 
     #[test]
@@ -221,23 +299,60 @@ mod tests {
     #[test]
     fn workers_are_told_when_the_owner_goes_away() {
         let mut broker = Broker::new(1000);
-        broker.wanted(WorkerId(1), hash(1), &[OWNER]);
-        broker.wanted(WorkerId(2), hash(1), &[OWNER]);
+        broker.wanted(WorkerId(1), hash(1), true, &[OWNER]);
+        broker.wanted(WorkerId(2), hash(1), true, &[OWNER]);
         broker.worker_gone(WorkerId(2));
         let orders = broker.client_gone(OWNER);
         assert!(matches!(&orders[..], [Order::Refuse(WorkerId(1), h, _)] if *h == hash(1)));
-        assert!(matches!(broker.wanted(WorkerId(1), hash(1), &[OWNER]), Some(Order::Ask(..))));
+        assert!(matches!(
+            broker.wanted(WorkerId(1), hash(1), true, &[OWNER]),
+            Some(Order::Ask(..))
+        ));
     }
 
     #[test]
     fn the_next_owner_is_asked_when_the_first_does_not_have_it() {
         let other = ClientId(2);
         let mut broker = Broker::new(1000);
-        broker.wanted(WorkerId(1), hash(1), &[OWNER, other]);
+        broker.wanted(WorkerId(1), hash(1), true, &[OWNER, other]);
         assert_eq!(broker.missing(OWNER, hash(1), "no"), [Order::Ask(other, hash(1))]);
         assert!(broker.missing(OWNER, hash(1), "no").is_empty(), "it has been asked already");
         let orders = broker.missing(other, hash(1), "no");
         assert_eq!(orders, [Order::Refuse(WorkerId(1), hash(1), "no".into())]);
+    }
+
+    #[test]
+    fn what_was_damaged_in_memory_is_found_when_it_is_asked_for_again() {
+        let mut broker = Broker::new(1000);
+        let sound = blob(10);
+        let hash = hash_of(&sound);
+        for (kept, again) in [(blob(10), false), (Bytes::from_static(b"damaged"), true)] {
+            broker.wanted(WorkerId(1), hash, true, &[OWNER]);
+            broker.arrived(hash, kept);
+            let order = broker.wanted(WorkerId(1), hash, false, &[OWNER]);
+            assert_eq!(matches!(order, Some(Order::Ask(..))), again, "{order:?}");
+            broker.kept.clear();
+            broker.by_age.clear();
+            broker.kept_bytes = 0;
+        }
+    }
+
+    #[test]
+    fn who_was_given_a_blob_is_remembered_the_first_one_first_and_not_without_end() {
+        let mut broker = Broker::new(1000);
+        for worker in [1, 2, 1, 3] {
+            broker.given(WorkerId(worker), hash(1));
+        }
+        assert_eq!(broker.holders(hash(1)), [2, 1, 3].map(WorkerId));
+        assert!(broker.holders(hash(2)).is_empty());
+        let many = |n: u32| BlobHash(std::array::from_fn(|at| n.to_le_bytes()[at % 4]));
+        for n in 0..HELD_MAX as u32 + 10 {
+            broker.given(WorkerId(4), many(n + 10_000));
+        }
+        assert_eq!((broker.held.len(), broker.held_by_age.len()), (HELD_MAX, HELD_MAX));
+        assert!(broker.holders(hash(1)).is_empty(), "the oldest goes");
+        (0..100).for_each(|worker| broker.given(WorkerId(worker), hash(5)));
+        assert_eq!(broker.holders(hash(5)).len(), HOLDERS_MAX);
     }
 
     proptest! {
@@ -246,7 +361,7 @@ mod tests {
             let mut broker = Broker::new(100);
             for (n, length, ask) in steps {
                 if ask {
-                    broker.wanted(WorkerId(1), hash(n), &[OWNER]);
+                    broker.wanted(WorkerId(1), hash(n), true, &[OWNER]);
                 } else {
                     broker.arrived(hash(n), blob(length));
                 }

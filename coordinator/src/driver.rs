@@ -20,7 +20,7 @@ use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{self, Outbox, OutboxEnd, Trust, is_this_pc};
+use terrafarm_wire::link::{self, Meter, Outbox, OutboxEnd, Trust, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -45,6 +45,9 @@ pub struct Config {
     pub name: String,
     /// Memory for terrain blobs on their way to workers, bytes.
     pub blob_memory_bytes: usize,
+    /// Bytes of terrain that may wait for links to workers before workers are sent to each
+    /// other for it.
+    pub redirect_above_bytes: u64,
     /// Most connections at once, greeting or greeted.
     pub connections_max: usize,
     /// Whom it lets in.
@@ -67,6 +70,7 @@ impl Default for Config {
         Config {
             name: "terrafarm".into(),
             blob_memory_bytes: 512 << 20,
+            redirect_above_bytes: 8 << 20,
             connections_max: 4608,
             trust: Trust::Loopback,
             strangers_max: 256,
@@ -138,15 +142,16 @@ pub async fn run_with_page(
         None => None,
     };
     let thumbnails = Arc::<Thumbnails>::default();
-    let sight = Sight { views, thumbnails: thumbnails.clone() };
+    let sight = Sight { views, thumbnails: thumbnails.clone(), unsent: Meter::default() };
     let last_shot = farm.last_shot.clone();
+    let unsent = sight.unsent.clone();
     let driver = tasks.spawn(drive(config.clone(), inbox, sight, last_shot, stop.clone()));
     let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
     if let Some(web) = web {
         tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
     }
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events, api::router(desk), stop.clone());
+    let admission = Admission::new(&config, events, api::router(desk), unsent, stop.clone());
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -173,7 +178,6 @@ pub async fn run_with_page(
 }
 
 /// What the driver receives.
-#[expect(clippy::large_enum_variant, reason = "nearly every one is an event")]
 pub enum ToDriver {
     /// A peer has greeted; here is how to answer it.
     Open(Peer, Outbox, CancellationToken, peer::PeerTraits),
@@ -202,7 +206,7 @@ impl FarmLine {
     /// If the coordinator is stopping.
     pub async fn join(&self, client: ClientId, name: &str) -> Result<OutboxEnd, OrderError> {
         let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
-        let greeting = Greeting { name: name.to_owned(), threads: 0 };
+        let greeting = Greeting { name: name.to_owned(), threads: 0, address: None };
         let traits = peer::PeerTraits { greeting, loopback: true };
         let open = ToDriver::Open(Peer::Client(client), outbox, CancellationToken::new(), traits);
         self.events.send(open).await.map_err(|_| OrderError::Stopping)?;
@@ -247,10 +251,12 @@ struct Line {
     loopback: bool,
 }
 
-/// Where the driver puts what is to be seen.
+/// Where the driver puts what is to be seen, and what it looks at.
 struct Sight {
     views: watch::Sender<Arc<FarmView>>,
     thumbnails: Arc<Thumbnails>,
+    /// Of what waits for links to workers.
+    unsent: Meter,
 }
 
 async fn drive(
@@ -264,6 +270,7 @@ async fn drive(
     let now = || Micros(epoch.elapsed().as_micros() as u64);
     let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
     let mut farm = farm.counted_by(last_shot);
+    farm.redirect_above(config.redirect_above_bytes);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     let mut looks = tokio::time::interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -279,6 +286,7 @@ async fn drive(
                 }
                 Some(ToDriver::Event(peer, event)) => {
                     let gone = matches!(event, PeerEvent::Gone(..));
+                    farm.set_unsent(sight.unsent.bytes());
                     farm.handle(now(), peer, event);
                     if gone {
                         lines.remove(&peer);
@@ -391,7 +399,8 @@ impl FarmLine {
         let (events, inbox) = mpsc::channel(EVENTS);
         let (views, view) = watch::channel(Arc::default());
         let line = FarmLine { events, view, last_shot: Arc::default() };
-        let sight = Sight { views, thumbnails: Arc::default() };
+        let unsent = Meter::default();
+        let sight = Sight { views, thumbnails: Arc::default(), unsent };
         tokio::spawn(drive(config, inbox, sight, line.last_shot.clone(), stop));
         line
     }
@@ -399,7 +408,7 @@ impl FarmLine {
     /// A worker inside this process; what the farm says to it comes out of the end.
     pub async fn hire(&self, worker: WorkerId) -> OutboxEnd {
         let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
-        let greeting = Greeting { name: format!("{worker}"), threads: 2 };
+        let greeting = Greeting { name: format!("{worker}"), threads: 2, address: None };
         let traits = peer::PeerTraits { greeting, loopback: true };
         let open = ToDriver::Open(Peer::Worker(worker), outbox, CancellationToken::new(), traits);
         let _ = self.events.send(open).await;

@@ -6,22 +6,24 @@
 
 mod desk;
 mod tally;
+mod terrain;
 mod trust;
 
-use crate::blobs::{Broker, ClientId, Order};
+use crate::blobs::{Broker, ClientId};
 use crate::shots::{Adoption, FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use terrafarm_common::accuracy::Share;
-use terrafarm_common::id::{LeaseId, ShotId, WorkerId};
+use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_sched::{Action, Event, LostReason, Micros, Scheduler};
 use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::limits::clip_reason;
 use terrafarm_wire::message::{
-    Blob, CloseShot, Done, FrameFailed, Goodbye, Grant, Message, NoBlob, OpenShot, Ping, Pong,
-    Progress, Rejected, Revoke, ShotFailed, Timesheet, WantBlobs,
+    CloseShot, Done, FrameFailed, Goodbye, Grant, Message, OpenShot, Ping, Pong, Progress,
+    Rejected, Revoke, ShotFailed, Timesheet,
 };
 
 /// Shortest time between two progress messages of a shot, microseconds.
@@ -57,6 +59,8 @@ pub struct Greeting {
     pub name: String,
     /// Render threads; 0 for a client.
     pub threads: u32,
+    /// Where it connects from; `None` inside this process.
+    pub address: Option<IpAddr>,
 }
 
 /// Something to be done by the driver.
@@ -86,6 +90,10 @@ pub struct Farm {
     /// For those who look at the farm.
     tally: tally::Tally,
     trust: trust::Trust,
+    /// Bytes of terrain that wait for links to workers, and from how many on workers are sent
+    /// to each other.
+    unsent_bytes: u64,
+    redirect_above_bytes: u64,
 }
 
 #[derive(Debug)]
@@ -93,6 +101,10 @@ struct WorkerState {
     greeting: Greeting,
     /// Shots it has been told of.
     opened: BTreeSet<ShotId>,
+    /// At which frame of a shot it is to be told anew what lies ahead.
+    ahead: BTreeMap<ShotId, FrameIndex>,
+    /// Where it gives blobs to others.
+    shelf: Option<SocketAddr>,
     leases: BTreeSet<LeaseId>,
 }
 
@@ -111,6 +123,8 @@ impl Farm {
             pings: 0,
             tally: tally::Tally::default(),
             trust: trust::Trust::new(is_auditing),
+            unsent_bytes: 0,
+            redirect_above_bytes: u64::MAX,
         }
     }
 
@@ -118,6 +132,17 @@ impl Farm {
     pub fn counted_by(mut self, last_shot: Arc<AtomicU64>) -> Self {
         self.shots = Shots::counted_by(last_shot);
         self
+    }
+
+    /// Sends workers to each other for terrain when more than so many bytes of it wait for
+    /// links. It never does unless this is called.
+    pub fn redirect_above(&mut self, bytes: u64) {
+        self.redirect_above_bytes = bytes;
+    }
+
+    /// So many bytes wait for links to workers now.
+    pub fn set_unsent(&mut self, bytes: u64) {
+        self.unsent_bytes = bytes;
     }
 
     /// What to do next; `None` when all is said. Call until then after every other call.
@@ -149,8 +174,13 @@ impl Farm {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
                 let is_distrusted = self.trust.is_distrusted(&greeting.name);
-                let state =
-                    WorkerState { greeting, opened: BTreeSet::new(), leases: BTreeSet::new() };
+                let state = WorkerState {
+                    greeting,
+                    opened: BTreeSet::new(),
+                    ahead: BTreeMap::new(),
+                    shelf: None,
+                    leases: BTreeSet::new(),
+                };
                 self.workers.insert(worker, state);
                 self.tally.joined(worker, now);
                 self.schedule(now, Event::WorkerJoined { worker, threads });
@@ -206,6 +236,7 @@ impl Farm {
                 self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
             }
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
+            Message::Sharing(sharing) => self.shares(worker, sharing.port),
             Message::Goodbye(goodbye) => {
                 tracing::debug!(%worker, "says goodbye: {}", goodbye.reason);
             }
@@ -310,40 +341,6 @@ impl Farm {
                 let reason = clip_reason(&why);
                 self.send(Peer::Client(client), Rejected { number, reason });
             }
-        }
-    }
-
-    fn want_blobs(&mut self, worker: WorkerId, want: &WantBlobs) {
-        let opened = self.workers.get(&worker).map(|state| &state.opened);
-        let owners: BTreeSet<_> = opened
-            .into_iter()
-            .flatten()
-            .filter_map(|shot| self.shots.get(*shot).map(|shot| shot.client))
-            .collect();
-        let owners: Vec<_> = owners.into_iter().collect();
-        let orders =
-            want.hashes.iter().filter_map(|&hash| self.broker.wanted(worker, hash, &owners));
-        let orders = orders.collect();
-        self.carry_out(orders);
-    }
-
-    /// Carries out the broker's orders; questions to one client become one message.
-    fn carry_out(&mut self, orders: Vec<Order>) {
-        let mut asks: BTreeMap<ClientId, Vec<_>> = BTreeMap::new();
-        for order in orders {
-            match order {
-                Order::Deliver(worker, hash, bytes) => {
-                    self.send(Peer::Worker(worker), Blob { hash, bytes });
-                }
-                Order::Refuse(worker, hash, why) => {
-                    let why = clip_reason(&why);
-                    self.send(Peer::Worker(worker), NoBlob { hash, why });
-                }
-                Order::Ask(client, hash) => asks.entry(client).or_default().push(hash),
-            }
-        }
-        for (client, hashes) in asks {
-            self.send(Peer::Client(client), WantBlobs { hashes });
         }
     }
 
@@ -534,6 +531,7 @@ impl Farm {
             self.send(Peer::Worker(worker), open);
         }
         self.send(Peer::Worker(worker), Grant { lease, shot, frame, region, camera });
+        self.tell_ahead(worker, shot, frame);
     }
 
     fn finish_frame(&mut self, now: Micros, shot: ShotId, frame: u32) {
@@ -588,7 +586,10 @@ impl Farm {
         let told: Vec<_> = self
             .workers
             .iter_mut()
-            .filter_map(|(worker, state)| state.opened.remove(&shot).then_some(*worker))
+            .filter_map(|(worker, state)| {
+                state.ahead.remove(&shot);
+                state.opened.remove(&shot).then_some(*worker)
+            })
             .collect();
         for worker in told {
             self.send(Peer::Worker(worker), CloseShot { shot });

@@ -10,8 +10,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Trust, handshake};
-use terrafarm_wire::message::{Message, Pong, Role};
+use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Meter, Trust, handshake};
+use terrafarm_wire::message::{Message, Pong, Refusal, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_util::sync::CancellationToken;
@@ -45,6 +45,8 @@ pub struct Admission {
     api: Router,
     desks: Arc<Semaphore>,
     stop: CancellationToken,
+    /// Of what waits for links to workers.
+    unsent: Meter,
 }
 
 /// What the driver has to know of a peer.
@@ -61,6 +63,7 @@ impl Admission {
         config: &Config,
         events: mpsc::Sender<ToDriver>,
         api: Router,
+        unsent: Meter,
         stop: CancellationToken,
     ) -> Self {
         Admission {
@@ -76,6 +79,7 @@ impl Admission {
             api,
             desks: Arc::new(Semaphore::new(DESKS_MAX)),
             stop,
+            unsent,
         }
     }
 
@@ -101,6 +105,10 @@ pub async fn serve(
             return;
         }
     };
+    if matches!(greeted.hello().role, Role::Peer) {
+        let text = "a coordinator serves workers and clients; a peer asks workers";
+        return greeted.refuse(Refusal::Malformed, text).await;
+    }
     let id = admission.last_id.fetch_add(1, Ordering::Relaxed) + 1;
     let welcomed = greeted.welcome(id, &admission.name, admission.heartbeat, admission.silence);
     let (connection, hello) = match welcomed.await {
@@ -112,16 +120,17 @@ pub async fn serve(
     };
     let (is_worker, threads) = match hello.role {
         Role::Worker { threads, .. } => (true, threads),
-        Role::Client => (false, 0),
+        Role::Client | Role::Peer => (false, 0),
         Role::Desk => return desk(connection, &admission).await,
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();
-    let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
+    let meter = if is_worker { admission.unsent.clone() } else { Meter::default() };
+    let (outbox, queues) = link::metered(URGENT_QUEUE, BULK_QUEUE, meter);
     let hang_up = CancellationToken::new();
     let writing = tokio::spawn(writer.run(queues));
     let traits = PeerTraits {
-        greeting: Greeting { name: hello.name, threads },
+        greeting: Greeting { name: hello.name, threads, address: Some(address.ip()) },
         loopback: link::is_this_pc(address.ip()),
     };
     if admission.events.send(ToDriver::Open(peer, outbox, hang_up.clone(), traits)).await.is_err() {

@@ -4,8 +4,8 @@
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
 //! the session asks for over one connection; [`office`] says when and with how many threads
-//! a worker on somebody's PC works; `backoff` says when to try again, `clock` where the
-//! time goes, `trial` how fast this PC is. A [`sleeper`]
+//! a worker on somebody's PC works; `share` passes terrain from worker to worker; `backoff`
+//! says when to try again, `clock` where the time goes, `trial` how fast this PC is. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
@@ -18,6 +18,7 @@ mod clock;
 pub mod office;
 pub mod render;
 pub mod session;
+mod share;
 mod shift;
 pub mod sleeper;
 pub mod terrain;
@@ -28,6 +29,7 @@ pub use render::{Caster, RayCaster};
 
 use backoff::Backoff;
 use office::{Gate, Rules, Watch};
+use share::{Others, Shelf};
 use shift::{Shift, Site};
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -69,11 +71,27 @@ pub struct WorkerConfig {
     /// Most that is sent and most that is received, bytes per second each; no limit if
     /// `None`.
     pub bandwidth_bytes_per_s: Option<u64>,
+    /// Whether other workers of the farm are given tiles of the cache folder.
+    pub share: ShareTiles,
     /// What to do when there is no connection.
     pub reconnect: Reconnect,
     /// A number of this process: the worker's incarnation and the seed of its back-off.
     /// Two workers should have different ones.
     pub seed: u64,
+}
+
+/// Whether a worker gives its tiles to others of its farm, which spares the coordinator's
+/// link. It listens on the address that it reaches the coordinator from, for those whom
+/// [`WorkerConfig::trust`] lets in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ShareTiles {
+    /// It does not listen.
+    Never,
+    /// At a free port, unless the coordinator is on this PC: then there is no link to spare.
+    #[default]
+    Beyond,
+    /// At this port wherever the coordinator is; 0 is a free one.
+    At(u16),
 }
 
 /// Why a worker has ended without an error.
@@ -166,10 +184,11 @@ async fn work<C: Caster>(
         }
         let why = match connect(&config, &stop).await {
             Ok(None) => return Ok(Ended::Stopped),
-            Ok(Some((connection, welcome, peer))) => {
+            Ok(Some((connection, welcome, [own, peer]))) => {
                 info!(coordinator = welcome.coordinator, peer = %peer, "connected");
                 backoff.reset();
                 welcomed = true;
+                share(&config, &mut site, own, peer).await;
                 let shift = Shift::new(&mut site, !is_this_pc(peer.ip()), &welcome);
                 let leave = stop.child_token();
                 match watch.over(shift.work(connection, &leave), &leave).await {
@@ -245,10 +264,42 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     let pixels_per_s = trial.await.ok().flatten();
     debug!(pixels_per_s, "tried how fast this worker is");
     let gate = Gate::new(threads);
-    Ok(Site { pool, cache, terrain, caster, gate, pixels_per_s })
+    let others = Arc::new(Others::new(config.trust.clone(), &config.name));
+    Ok(Site { pool, cache, terrain, caster, gate, pixels_per_s, shelf: None, others, damaged: 0 })
 }
 
-type Connected = (Connection<Paced<TcpStream>>, Welcome, SocketAddr);
+/// Opens the shelf for other workers on the address `own` that the coordinator, `peer`, is
+/// reached from, unless it is open there already. Without one the worker works as well.
+async fn share<C: Caster>(
+    config: &WorkerConfig,
+    site: &mut Site<C>,
+    own: SocketAddr,
+    peer: SocketAddr,
+) {
+    let port = match config.share {
+        ShareTiles::Never => return,
+        ShareTiles::Beyond if is_this_pc(peer.ip()) => return,
+        ShareTiles::Beyond => 0,
+        ShareTiles::At(port) => port,
+    };
+    let Some(cache) = site.cache.clone() else { return };
+    if site.shelf.as_ref().is_some_and(|shelf| shelf.address().ip() == own.ip()) {
+        return;
+    }
+    site.shelf = None;
+    let mut address = own;
+    address.set_port(port);
+    match Shelf::open(address, cache, config.trust.clone(), &config.name).await {
+        Ok(shelf) => {
+            info!(address = %shelf.address(), "gives terrain to other workers");
+            site.shelf = Some(shelf);
+        }
+        Err(error) => warn!(%address, %error, "cannot give terrain to other workers"),
+    }
+}
+
+/// A connection, what the coordinator said, and the addresses of both ends, ours first.
+type Connected = (Connection<Paced<TcpStream>>, Welcome, [SocketAddr; 2]);
 
 /// A greeted connection; `None` if the worker is told to stop meanwhile.
 async fn connect(
@@ -260,6 +311,7 @@ async fn connect(
         let stream = connecting.await.map_err(|_| HandshakeError::TimedOut(CONNECT_LIMIT))?;
         let stream = stream.map_err(terrafarm_wire::link::LinkError::Io)?;
         let peer = stream.peer_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
+        let own = stream.local_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
         // Small messages must not wait for others to fill a packet.
         if let Err(error) = stream.set_nodelay(true) {
             warn!(%error, "the connection stays slow for small messages");
@@ -270,7 +322,7 @@ async fn connect(
         let token = config.trust.token_for(peer.ip())?;
         let stream = Paced::new(stream, config.bandwidth_bytes_per_s);
         let (connection, welcome) = greet(stream, token, hello, CONNECT_LIMIT).await?;
-        Ok((connection, welcome, peer))
+        Ok((connection, welcome, [own, peer]))
     };
     tokio::select! {
         connected = attempt => connected.map(Some),

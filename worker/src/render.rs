@@ -55,6 +55,12 @@ pub trait Caster: Send + Sync + 'static {
     /// The pixels of a piece that waits for nothing.
     fn finish(&self, piece: Self::Piece) -> Rendered;
 
+    /// The tiles that a region of a view will probably need and that are not in memory: a
+    /// guess, soon made. A caster that needs no tiles has none to name.
+    fn scout(&self, _scene: &Scene<Self::Prepared>, _view: &View, _region: Region) -> Vec<TileKey> {
+        Vec::new()
+    }
+
     /// How wrong the answer of the view's method is for pixel (x, y).
     ///
     /// # Errors
@@ -109,6 +115,10 @@ impl Caster for RayCaster {
 
     fn finish(&self, piece: Progress) -> Rendered {
         piece.into_rendered(Vec::new())
+    }
+
+    fn scout(&self, scene: &Scene<Pyramid>, view: &View, region: Region) -> Vec<TileKey> {
+        terrafarm_raycast::scout(&scene.resident, &scene.prepared, view, region)
     }
 
     fn gauge(

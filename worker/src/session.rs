@@ -9,31 +9,37 @@
 //! ray caster names tiles that are not in memory, it pauses for them and renders what is
 //! left. At most one job is begun at a time: it is spread over all cores. A blob is
 //! looked for on this PC first, then asked of the coordinator, each once however many
-//! wait for it.
+//! wait for it; the coordinator may name other workers that have it (`supply`).
+//!
+//! While nothing better is to be done, the views of the grants that wait and of the way
+//! ahead are looked at (`outlook`), and the tiles that they will need are fetched.
 //!
 //! Every lease is answered exactly once, by `Done`, `Failed` or `HandBack`, unless it is
 //! revoked; then never.
 
+mod outlook;
+mod supply;
 #[cfg(test)]
 mod tests;
 
-use std::collections::btree_map::Entry;
+pub use outlook::Glance;
+pub use supply::{ASKED_MAX, EARLY_MAX, Source};
+
+use outlook::Outlook;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
+use supply::{Failure, Supply};
 use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_wire::Message;
 use terrafarm_wire::limits::{HAND_BACK_MAX, clip_reason};
 use terrafarm_wire::message::{
-    Blob, Done, Failed, Goodbye, Grant, HandBack, NoBlob, OpenShot, WantBlobs,
+    Blob, Done, Elsewhere, Failed, Goodbye, Grant, HandBack, NoBlob, OpenShot,
 };
 
 /// Most grants that wait; more are handed back at once.
 pub const QUEUE_MAX: usize = 1024;
 /// Most shots that are open; grants of others fail.
 pub const SHOTS_MAX: usize = 1024;
-/// Most blobs asked of the coordinator and not yet answered. Tiles have a few hundred
-/// kilobytes at most, so this is what gigabit Ethernet carries in a fifth of a second.
-pub const ASKED_MAX: usize = 64;
 
 /// What can happen.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,8 +50,20 @@ pub enum Event {
     Loaded(BlobHash),
     /// A blob is not on this PC.
     Absent(BlobHash),
-    /// A blob is not what it should be: it cannot be used.
+    /// A blob is what was asked for, and yet it cannot be used.
     Spoiled(BlobHash, String),
+    /// What came is not what was asked for.
+    Damaged(BlobHash),
+    /// A blob for later is on this PC, and in memory if there is room.
+    Stocked(BlobHash),
+    /// There is no room for a blob for later, neither in memory nor on disk.
+    NoRoom(BlobHash),
+    /// Another worker gave a blob.
+    Fetched(Blob),
+    /// No other worker gave it.
+    Unfetched(BlobHash),
+    /// The view will need these blobs that are not in memory.
+    Glanced(Vec<BlobHash>),
     /// The job has done what it can without these blobs; they are at least one.
     Paused(LeaseId, Vec<BlobHash>),
     /// The job is done.
@@ -67,8 +85,19 @@ pub enum Action {
     Send(Message),
     /// Look for a blob on this PC: answered by `Loaded`, `Absent` or `Spoiled`.
     Load(BlobHash),
-    /// A blob has come: check it, keep it, load it. Answered by `Loaded` or `Spoiled`.
+    /// A blob has come: check it, keep it, load it. Answered by `Loaded`, `Damaged` or
+    /// `Spoiled`.
     Take(Blob),
+    /// Look for a blob for later on this PC: answered by `Stocked`, `NoRoom`, `Absent` or
+    /// `Spoiled`.
+    Seek(BlobHash),
+    /// A blob for later has come: check it and keep it. Answered by `Stocked`, `NoRoom`,
+    /// `Damaged` or `Spoiled`.
+    Stock(Blob),
+    /// Ask other workers for a blob: answered by `Fetched` or `Unfetched`.
+    Fetch(Elsewhere),
+    /// Find out which tiles a view will need: answered by `Glanced`.
+    Glance(Glance, Arc<OpenShot>),
     /// Begin a job; the index of its store is loaded. Answered by `Paused`, `Rendered` or
     /// `Broken`, and also by `Stopped` after a [`Action::Stop`].
     Start(Grant, Arc<OpenShot>),
@@ -78,6 +107,8 @@ pub enum Action {
     Stop(LeaseId),
     /// Forget the paused job. Not answered.
     Discard(LeaseId),
+    /// A shot is over.
+    Close(ShotId),
     /// No open shot uses this store any more.
     Release(BlobHash),
     /// All is said: close the connection once it is sent.
@@ -88,15 +119,24 @@ pub enum Action {
 #[derive(Debug, Default)]
 pub struct Session {
     shots: BTreeMap<ShotId, Arc<OpenShot>>,
-    queue: VecDeque<Grant>,
+    queue: VecDeque<Queued>,
     current: Option<Current>,
-    blobs: BTreeMap<BlobHash, Supply>,
-    wanted: VecDeque<BlobHash>,
-    asked: usize,
+    supply: Supply,
+    outlook: Outlook,
+    /// Stores whose index is in memory.
+    mapped: BTreeSet<BlobHash>,
     unsent: usize,
     leaving: Option<String>,
     ended: bool,
     actions: VecDeque<Action>,
+}
+
+/// A job that waits for its turn.
+#[derive(Debug)]
+struct Queued {
+    grant: Grant,
+    /// Its view has been looked at.
+    seen: bool,
 }
 
 /// The job that has been begun, or waits for the index of its store.
@@ -132,17 +172,6 @@ pub enum Doing {
     Sending,
 }
 
-/// How a blob that is not in memory comes there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Supply {
-    /// Being looked for on this PC, or being decoded.
-    Loading,
-    /// To be asked of the coordinator.
-    Wanted,
-    /// Asked of the coordinator.
-    Asked,
-}
-
 impl Session {
     /// A session that holds nothing.
     pub fn new() -> Self {
@@ -157,13 +186,23 @@ impl Session {
         match event {
             Event::Received(message) => self.receive(message),
             Event::Loaded(hash) => self.supplied(hash),
-            Event::Absent(hash) => {
-                if self.blobs.get(&hash) == Some(&Supply::Loading) {
-                    self.blobs.insert(hash, Supply::Wanted);
-                    self.wanted.push_back(hash);
-                }
+            Event::Absent(hash) => self.supply.absent(hash),
+            Event::Spoiled(hash, why) => {
+                let failure = self.supply.lost(hash);
+                self.failed_supply(hash, failure, &why);
             }
-            Event::Spoiled(hash, why) => self.failed_supply(hash, &why),
+            Event::Damaged(hash) => {
+                let failure = self.supply.damaged(hash);
+                self.failed_supply(hash, failure, "what came has another hash");
+            }
+            Event::Stocked(hash) => self.supply.stocked(hash, &mut self.actions),
+            Event::NoRoom(hash) => self.supply.no_room(hash, &mut self.actions),
+            Event::Fetched(blob) => self.supply.arrived(blob, Source::Peer, &mut self.actions),
+            Event::Unfetched(hash) => self.supply.unfetched(hash),
+            Event::Glanced(hashes) => {
+                self.outlook.answered();
+                self.supply.foresee(hashes);
+            }
             Event::Paused(lease, missing) => self.pause(lease, missing),
             Event::Rendered(done) => {
                 if self.leave_job(done.lease) {
@@ -184,6 +223,7 @@ impl Session {
         }
         self.begin();
         self.ask();
+        self.look_ahead();
         self.finish();
     }
 
@@ -204,31 +244,34 @@ impl Session {
 
     fn receive(&mut self, message: Message) {
         match message {
-            Message::OpenShot(shot)
-                if self.shots.len() < SHOTS_MAX => {
-                    self.shots.insert(shot.shot, Arc::new(shot));
-                }
+            Message::OpenShot(shot) if self.shots.len() < SHOTS_MAX => {
+                self.shots.insert(shot.shot, Arc::new(shot));
+            }
             Message::Grant(grant) => self.granted(grant),
             Message::Revoke(revoke) => self.revoke(revoke.lease),
             Message::CloseShot(close) => self.close(close.shot),
-            Message::Blob(blob)
-                // One that was not asked for is dropped unread.
-                if self.answered(blob.hash) => {
-                    self.blobs.insert(blob.hash, Supply::Loading);
-                    self.actions.push_back(Action::Take(blob));
-                }
-            Message::NoBlob(NoBlob { hash, why })
-                if self.answered(hash) => {
-                    self.failed_supply(hash, &why);
-                }
+            Message::Ahead(ahead) if self.shots.contains_key(&ahead.shot) => {
+                self.outlook.hear(ahead);
+            }
+            Message::Blob(blob) => {
+                self.supply.arrived(blob, Source::Coordinator, &mut self.actions);
+            }
+            Message::Elsewhere(elsewhere) => {
+                self.supply.redirected(elsewhere, &mut self.actions);
+            }
+            Message::NoBlob(NoBlob { hash, why }) => {
+                let failure = self.supply.refused(hash);
+                self.failed_supply(hash, failure, &why);
+            }
             Message::Drain(_) => self.leave("the coordinator asked for it".to_owned()),
             _ => {}
         }
     }
 
     fn granted(&mut self, grant: Grant) {
-        let held = self.queue.iter().chain(self.current.as_ref().map(|job| &job.grant));
-        if held.into_iter().any(|other| other.lease == grant.lease) {
+        let queued = self.queue.iter().map(|queued| &queued.grant);
+        let mut held = queued.chain(self.current.as_ref().map(|job| &job.grant));
+        if held.any(|other| other.lease == grant.lease) {
             return;
         }
         let Some(shot) = self.shots.get(&grant.shot) else {
@@ -241,11 +284,11 @@ impl Session {
         if self.leaving.is_some() || self.queue.len() >= QUEUE_MAX {
             return self.send(HandBack { leases: vec![grant.lease] });
         }
-        self.queue.push_back(grant);
+        self.queue.push_back(Queued { grant, seen: false });
     }
 
     fn revoke(&mut self, lease: LeaseId) {
-        self.queue.retain(|grant| grant.lease != lease);
+        self.queue.retain(|queued| queued.grant.lease != lease);
         if let Some(job) = self.current.as_mut().filter(|job| job.grant.lease == lease) {
             match job.phase {
                 Phase::Rendering => {
@@ -260,11 +303,16 @@ impl Session {
 
     fn close(&mut self, shot: ShotId) {
         let Some(closed) = self.shots.remove(&shot) else { return };
+        let of_shot = |queued: &Queued| queued.grant.shot == shot;
         let orphans: Vec<_> =
-            self.queue.iter().filter(|grant| grant.shot == shot).map(|grant| grant.lease).collect();
-        self.queue.retain(|grant| grant.shot != shot);
+            self.queue.iter().filter(|q| of_shot(q)).map(|q| q.grant.lease).collect();
+        self.queue.retain(|queued| !of_shot(queued));
         self.hand_back(orphans);
+        self.outlook.close(shot);
+        self.supply.forget_foreseen();
+        self.actions.push_back(Action::Close(shot));
         if !self.shots.values().any(|open| open.index == closed.index) {
+            self.mapped.remove(&closed.index);
             self.actions.push_back(Action::Release(closed.index));
         }
     }
@@ -272,7 +320,7 @@ impl Session {
     fn leave(&mut self, reason: String) {
         if self.leaving.is_none() {
             self.leaving = Some(reason);
-            let unbegun = self.queue.drain(..).map(|grant| grant.lease).collect();
+            let unbegun = self.queue.drain(..).map(|queued| queued.grant.lease).collect();
             self.hand_back(unbegun);
         }
     }
@@ -280,12 +328,12 @@ impl Session {
     /// Takes the next grant of the queue, unless one is begun or the link is behind.
     fn begin(&mut self) {
         while self.current.is_none() && self.unsent == 0 {
-            let Some(grant) = self.queue.pop_front() else { return };
+            let Some(Queued { grant, .. }) = self.queue.pop_front() else { return };
             let Some(shot) = self.shots.get(&grant.shot).cloned() else { continue };
             let index = shot.index;
             let phase = Phase::Waiting(BTreeSet::from([index]));
             self.current = Some(Current { grant, shot, phase, begun: false });
-            self.need(index);
+            self.supply.need(index, &mut self.actions);
         }
     }
 
@@ -309,7 +357,9 @@ impl Session {
         match job.phase {
             Phase::Rendering => {
                 job.phase = Phase::Waiting(missing.iter().copied().collect());
-                missing.into_iter().for_each(|hash| self.need(hash));
+                for hash in missing {
+                    self.supply.need(hash, &mut self.actions);
+                }
             }
             Phase::Stopping => self.drop_waiting(),
             Phase::Waiting(_) => {}
@@ -331,15 +381,8 @@ impl Session {
         }
     }
 
-    fn need(&mut self, hash: BlobHash) {
-        if let Entry::Vacant(unknown) = self.blobs.entry(hash) {
-            unknown.insert(Supply::Loading);
-            self.actions.push_back(Action::Load(hash));
-        }
-    }
-
     fn supplied(&mut self, hash: BlobHash) {
-        self.blobs.remove(&hash);
+        self.supply.loaded(hash);
         let Some(job) = self.current.as_mut() else { return };
         let Phase::Waiting(missing) = &mut job.phase else { return };
         if missing.remove(&hash) && missing.is_empty() {
@@ -347,54 +390,53 @@ impl Session {
             self.actions.push_back(if std::mem::replace(&mut job.begun, true) {
                 Action::Resume(job.grant.lease)
             } else {
+                self.mapped.insert(job.shot.index);
+                self.supply.job_begins();
                 Action::Start(job.grant, job.shot.clone())
             });
         }
     }
 
-    /// A blob cannot be had: the job that waits for it fails.
-    fn failed_supply(&mut self, hash: BlobHash, why: &str) {
-        self.blobs.remove(&hash);
-        let Some(job) = &self.current else { return };
-        if matches!(&job.phase, Phase::Waiting(missing) if missing.contains(&hash)) {
-            let lease = job.grant.lease;
+    /// If a blob cannot be had, the job that waits for it fails.
+    fn failed_supply(&mut self, hash: BlobHash, failure: Option<Failure>, why: &str) {
+        if failure == Some(Failure::Urgent) && self.waits_for(hash) {
+            let Some(lease) = self.current.as_ref().map(|job| job.grant.lease) else { return };
             self.drop_waiting();
             self.fail(lease, &format!("cannot get terrain blob {hash}: {why}"));
         }
     }
 
-    /// Whether a blob was asked of the coordinator; it no longer is.
-    fn answered(&mut self, hash: BlobHash) -> bool {
-        let asked = self.blobs.get(&hash) == Some(&Supply::Asked);
-        if asked {
-            self.blobs.remove(&hash);
-            self.asked -= 1;
-        }
-        asked
+    fn waits_for(&self, hash: BlobHash) -> bool {
+        let phase = self.current.as_ref().map(|job| &job.phase);
+        matches!(phase, Some(Phase::Waiting(missing)) if missing.contains(&hash))
     }
 
-    /// Asks the coordinator for blobs, many at a time, as long as someone waits for them.
-    fn ask(&mut self) {
-        if self.wanted.is_empty() || self.asked > ASKED_MAX / 2 {
+    /// Looks at a view of what comes, when all that was foreseen before is under way.
+    fn look_ahead(&mut self) {
+        if self.leaving.is_some() || !self.supply.sees_no_more() {
             return;
         }
-        let mut hashes = Vec::new();
-        while self.asked < ASKED_MAX {
-            let Some(hash) = self.wanted.pop_front() else { break };
-            let waits = self.current.as_ref().is_some_and(
-                |job| matches!(&job.phase, Phase::Waiting(missing) if missing.contains(&hash)),
-            );
-            if waits {
-                self.blobs.insert(hash, Supply::Asked);
-                self.asked += 1;
-                hashes.push(hash);
-            } else {
-                self.blobs.remove(&hash);
-            }
+        let (shots, mapped) = (&self.shots, &self.mapped);
+        let ready = |shot| shots.get(&shot).is_some_and(|open| mapped.contains(&open.index));
+        let grants = self.queue.iter_mut().map(|queued| (&queued.grant, &mut queued.seen));
+        if let Some(glance) = self.outlook.next(grants, ready)
+            && let Some(shot) = self.shots.get(&glance.shot)
+        {
+            self.actions.push_back(Action::Glance(glance, shot.clone()));
         }
-        if !hashes.is_empty() {
-            self.send(WantBlobs { hashes });
-        }
+    }
+
+    /// Asks for blobs: those that the job waits for, or, if it waits for none, a few of
+    /// those that will be needed.
+    fn ask(&mut self) {
+        let phase = self.current.as_ref().map(|job| &job.phase);
+        let missing = match phase {
+            Some(Phase::Waiting(missing)) => Some(missing),
+            _ => None,
+        };
+        let waits = |hash| missing.is_some_and(|missing| missing.contains(&hash));
+        let calm = missing.is_none() && self.leaving.is_none();
+        self.supply.ask(waits, calm, &mut self.actions);
     }
 
     fn hand_back(&mut self, leases: Vec<LeaseId>) {

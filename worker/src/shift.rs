@@ -5,19 +5,21 @@
 //! the thread pool, writing in a task of its own), so that a heartbeat is answered at
 //! once whatever else goes on.
 
+mod early;
+
 use crate::clock::{TaskClock, Worked};
 use crate::office::Gate;
 use crate::render::{Caster, Check, Job, Outcome, Picture, said};
 use crate::session::{Action, Doing, Event, Session};
+use crate::share::{Others, Shelf};
 use crate::terrain::Terrain;
-use bytes::Bytes;
 use rayon::ThreadPool;
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-use terrafarm_common::id::{BlobHash, LeaseId};
+use terrafarm_common::id::{BlobHash, FrameIndex, LeaseId, ShotId};
 use terrafarm_raycast::View;
 use terrafarm_terrain::cache::BlobCache;
 use terrafarm_terrain::codec::{self, CodecError};
@@ -27,7 +29,7 @@ use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
 use terrafarm_wire::message::{
-    Blob, Done, Grant, OpenShot, Pong, RenderReport, Speed, Timesheet, Welcome,
+    Blob, Done, Grant, OpenShot, Pong, RenderReport, Sharing, Speed, Timesheet, Welcome,
 };
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -51,14 +53,26 @@ pub(crate) struct Site<C: Caster> {
     pub gate: Gate,
     /// What a trial said of its speed.
     pub pixels_per_s: Option<u64>,
+    /// Where others may ask for its blobs, if they may.
+    pub shelf: Option<Shelf>,
+    pub others: Arc<Others>,
+    /// Blobs that the coordinator sent and that were not what they should be.
+    pub damaged: u64,
 }
 
 /// What the thread pool has done.
 enum Report<C: Caster> {
     Absent(BlobHash),
+    Damaged(BlobHash),
     Spoiled(BlobHash, String),
     Index(BlobHash, Box<Resident>, C::Prepared),
     Tile(BlobHash, Tile),
+    /// A tile before its turn, or what is on disk until then.
+    Early(BlobHash, Option<Tile>),
+    Fetched(Blob),
+    Unfetched(BlobHash),
+    /// The tiles of a store that a frame will need.
+    Glanced(BlobHash, (ShotId, FrameIndex), Vec<TileKey>),
     Done(Box<Done>, Worked),
     Missing(Box<Job<C>>, Vec<TileKey>),
     Stopped(LeaseId),
@@ -119,6 +133,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         let mut writing = tokio::spawn(writer.run(queues));
         if let Some(pixels_per_s) = self.site.pixels_per_s {
             outbox.send(Speed { pixels_per_s }).await?;
+        }
+        if let Some(shelf) = &self.site.shelf {
+            self.backlog.push_back(Sharing { port: shelf.address().port() }.into());
         }
         let mut asked_to_stop = false;
         while !(self.ended && self.backlog.is_empty()) {
@@ -188,6 +205,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Send(message) => self.send(message, outbox),
                 Action::Load(hash) => self.load(hash),
                 Action::Take(blob) => self.take(blob),
+                Action::Seek(hash) => self.seek(hash),
+                Action::Stock(blob) => self.stock(blob),
+                Action::Fetch(elsewhere) => self.fetch(elsewhere),
+                Action::Glance(glance, shot) => self.glance(glance, &shot),
                 Action::Start(grant, shot) => self.start(&grant, &shot),
                 Action::Resume(lease) => self.resume(lease),
                 Action::Stop(_) => {
@@ -197,6 +218,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Discard(_) => {
                     self.paused = None;
                     self.clock.discard(Instant::now());
+                    None
+                }
+                Action::Close(shot) => {
+                    self.site.terrain.close_shot(shot);
                     None
                 }
                 Action::Release(store) => {
@@ -229,13 +254,16 @@ impl<'a, C: Caster> Shift<'a, C> {
         if self.site.terrain.has_store(hash) {
             return Some(Event::Loaded(hash));
         }
+        if let Some(tile) = self.site.terrain.take_stowed(hash) {
+            return Some(self.add_tile(hash, &tile));
+        }
         let Some(cache) = self.site.cache.clone() else {
             return Some(Event::Absent(hash));
         };
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         self.spawn(
             move || {
-                counted(&unpacking_ns, || match cache.get(&hash) {
+                counted(&unpacking_ns, || match read(&cache, &hash) {
                     Some(bytes) => decoded(&*caster, hash, &bytes),
                     None => Report::Absent(hash),
                 })
@@ -249,20 +277,15 @@ impl<'a, C: Caster> Shift<'a, C> {
         let Blob { hash, bytes } = blob;
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
         let cache = self.site.cache.clone();
-        let keep = move |bytes: &Bytes| {
-            if let Some(Err(error)) = cache.map(|cache| cache.put(&hash, bytes)) {
-                warn!(%error, "a terrain blob was not kept");
-            }
-        };
         self.spawn(
             move || {
                 counted(&unpacking_ns, || {
                     if hash_of(&bytes) != hash {
-                        return Report::Spoiled(hash, "what came has another hash".to_owned());
+                        return Report::Damaged(hash);
                     }
                     let report = decoded(&*caster, hash, &bytes);
                     if !matches!(report, Report::Spoiled(..)) {
-                        keep(&bytes);
+                        keep(cache.as_deref(), &hash, &bytes);
                     }
                     report
                 })
@@ -274,7 +297,7 @@ impl<'a, C: Caster> Shift<'a, C> {
 
     fn start(&mut self, grant: &Grant, shot: &OpenShot) -> Option<Event> {
         debug!(lease = %grant.lease, shot = %grant.shot, frame = grant.frame, "job begins");
-        self.site.terrain.begin_job();
+        self.site.terrain.begin_job(grant.shot, grant.frame);
         let stop = Arc::new(AtomicBool::new(false));
         self.current = Some((shot.index, stop.clone()));
         let view =
@@ -330,6 +353,24 @@ impl<'a, C: Caster> Shift<'a, C> {
         let terrain = &mut self.site.terrain;
         match report {
             Report::Absent(hash) => Event::Absent(hash),
+            Report::Damaged(hash) => {
+                self.site.damaged += 1;
+                let damaged = self.site.damaged;
+                warn!(%hash, damaged, "a terrain blob came damaged and is fetched again");
+                Event::Damaged(hash)
+            }
+            Report::Early(hash, tile) => {
+                match tile {
+                    Some(tile) => terrain.stow(hash, tile),
+                    None => terrain.leave_on_disk(hash),
+                }
+                Event::Stocked(hash)
+            }
+            Report::Fetched(blob) => Event::Fetched(blob),
+            Report::Unfetched(hash) => Event::Unfetched(hash),
+            Report::Glanced(store, due, keys) => {
+                Event::Glanced(terrain.foresee_tiles(store, due, &keys))
+            }
             Report::Spoiled(hash, why) => {
                 terrain.give_up(hash);
                 Event::Spoiled(hash, why)
@@ -338,13 +379,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 terrain.add_store(hash, *resident, prepared);
                 Event::Loaded(hash)
             }
-            Report::Tile(hash, tile) => {
-                let added = terrain.add_tile(hash, &tile);
-                match added.err().or_else(|| terrain.over_limit()) {
-                    None => Event::Loaded(hash),
-                    Some(why) => Event::Spoiled(hash, why),
-                }
-            }
+            Report::Tile(hash, tile) => self.add_tile(hash, &tile),
             Report::Done(mut done, mut worked) => {
                 let threads = self.site.pool.current_num_threads().max(1) as u32;
                 worked.coreless /= threads;
@@ -376,6 +411,15 @@ impl<'a, C: Caster> Shift<'a, C> {
         }
     }
 
+    fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Event {
+        let terrain = &mut self.site.terrain;
+        let added = terrain.add_tile(hash, tile);
+        match added.err().or_else(|| terrain.over_limit()) {
+            None => Event::Loaded(hash),
+            Some(why) => Event::Spoiled(hash, why),
+        }
+    }
+
     fn stop_current(&mut self) {
         if let Some((_, stop)) = &self.current {
             stop.store(true, Ordering::Relaxed);
@@ -388,13 +432,21 @@ impl<'a, C: Caster> Shift<'a, C> {
         run: impl FnOnce() -> Report<C> + Send + 'static,
         panicked: impl FnOnce(String) -> Report<C> + Send + 'static,
     ) {
-        let reports = self.reports.clone();
-        self.site.pool.spawn(move || {
-            let report = catch_unwind(AssertUnwindSafe(run));
-            let report = report.unwrap_or_else(|panic| panicked(said(&*panic).to_owned()));
-            // Nobody listens once the connection is lost.
-            let _unheard = reports.blocking_send(report);
-        });
+        self.site.pool.spawn(reporting(self.reports.clone(), run, panicked));
+    }
+}
+
+/// Does something and reports what came of it, or its panic.
+fn reporting<C: Caster>(
+    reports: mpsc::Sender<Report<C>>,
+    run: impl FnOnce() -> Report<C>,
+    panicked: impl FnOnce(String) -> Report<C>,
+) -> impl FnOnce() {
+    move || {
+        let report = catch_unwind(AssertUnwindSafe(run));
+        let report = report.unwrap_or_else(|panic| panicked(said(&*panic).to_owned()));
+        // Nobody listens once the connection is lost.
+        let _unheard = reports.blocking_send(report);
     }
 }
 
@@ -412,6 +464,24 @@ fn counted<T>(into_ns: &AtomicU64, call: impl FnOnce() -> T) -> T {
     let result = call();
     into_ns.fetch_add(began.elapsed().as_nanos() as u64, Ordering::Relaxed);
     result
+}
+
+/// A blob of the cache, if it is there and sound.
+fn read(cache: &BlobCache, hash: &BlobHash) -> Option<Vec<u8>> {
+    let before = cache.damaged();
+    let found = cache.get(hash);
+    let damaged = cache.damaged();
+    if found.is_none() && damaged > before {
+        warn!(%hash, damaged, "a terrain blob was damaged on disk and is fetched again");
+    }
+    found
+}
+
+/// Keeps a blob on disk, if there is a cache.
+fn keep(cache: Option<&BlobCache>, hash: &BlobHash, bytes: &[u8]) {
+    if let Some(Err(error)) = cache.map(|cache| cache.put(hash, bytes)) {
+        warn!(%error, "a terrain blob was not kept");
+    }
 }
 
 /// A blob says itself whether it is a tile; what is none should be an index.

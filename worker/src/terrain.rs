@@ -1,18 +1,25 @@
 //! Decoded terrain in memory: stores, their tiles, and a limit.
 //!
-//! Tiles are forgotten in the order in which they were loaded, oldest first, when the
-//! limit is exceeded; the ray caster leaves no trace of what it looks at, and a tile that
-//! was wrongly forgotten comes back from the cache on disk in about a millisecond. Tiles
-//! that the present job has asked for stay until it ends: so a job always gets further.
+//! When the limit is exceeded, the tiles that no job has looked at for longest are
+//! forgotten first; the ray caster leaves a trace of what it looks at. Tiles that the
+//! present job has asked for stay until it ends: so a job always gets further. A tile that
+//! was wrongly forgotten comes back from the cache on disk in about a millisecond.
+//!
+//! Tiles that were fetched before their turn lie in the [`Pantry`], within an eighth of the
+//! limit, until the job that is due begins. Room for them is made by tiles that no job has
+//! looked at for long, never by what jobs use; where there is none they stay packed on disk.
 //!
 //! The roots of a store, a tile or a few for each layer, are loaded with the first tiles
 //! that a job asks for and stay as long as the store does: whoever cannot wait for a tile
 //! finds some ground there (`terrafarm_raycast::depths_at_hand`).
 
+mod pantry;
+
 use crate::render::Scene;
+use pantry::{Due, Pantry};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use terrafarm_common::id::BlobHash;
+use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::tile::{HEIGHT_TILE_BYTES, PHOTO_TILE_BYTES};
@@ -23,17 +30,26 @@ const IDLE_STORES_MAX: usize = 4;
 /// Part of the limit that the roots of a store may take: more are ordinary tiles.
 const ROOTS_PART: u64 = 8;
 
+/// Part of the limit that tiles before their turn may take.
+const PANTRY_PART: u64 = 8;
+
+/// Part of the limit that is freed beyond need, so that not every tile costs a look at all.
+const SLACK_PART: u64 = 16;
+
+/// Jobs that have not looked at a tile before it makes room for one before its turn: as
+/// many as a frame may have for one worker.
+const UNUSED_JOBS: u32 = 64;
+
 /// All terrain in memory. `P` is what the ray caster works out for each store.
 pub struct Terrain<P> {
     stores: BTreeMap<BlobHash, Store<P>>,
     /// Places that wait for a tile, by its hash. The same tile may lie at many: sea does.
     awaited: BTreeMap<BlobHash, Vec<Place>>,
-    /// Tiles in memory, oldest first.
-    loaded: VecDeque<Loaded>,
-    /// How many of the newest of them the present job has asked for.
-    pinned: usize,
+    /// Tiles in memory, in the order in which they came.
+    loaded: Vec<Loaded>,
     bytes: u64,
     limit_bytes: u64,
+    pantry: Pantry,
     /// Stores that no shot uses, oldest first.
     idle: VecDeque<BlobHash>,
 }
@@ -53,10 +69,13 @@ struct Place {
     key: TileKey,
 }
 
+/// One tile in memory, and where it lies.
 #[derive(Debug)]
 struct Loaded {
-    place: Place,
+    places: Vec<Place>,
     bytes: u64,
+    /// The present job has asked for it.
+    pinned: bool,
 }
 
 impl<P> Terrain<P> {
@@ -65,17 +84,17 @@ impl<P> Terrain<P> {
         Terrain {
             stores: BTreeMap::new(),
             awaited: BTreeMap::new(),
-            loaded: VecDeque::new(),
-            pinned: 0,
+            loaded: Vec::new(),
             bytes: 0,
             limit_bytes,
+            pantry: Pantry::new(limit_bytes / PANTRY_PART),
             idle: VecDeque::new(),
         }
     }
 
-    /// Bytes that decoded tiles take.
+    /// Bytes that decoded tiles take, those before their turn included.
     pub fn bytes(&self) -> u64 {
-        self.bytes
+        self.bytes + self.pantry.bytes()
     }
 
     /// Whether the index of this store is in memory. Marks it as used.
@@ -104,20 +123,38 @@ impl<P> Terrain<P> {
         if self.idle.len() > IDLE_STORES_MAX
             && let Some(oldest) = self.idle.pop_front()
         {
-            let roots = self.stores.remove(&oldest).map_or(0, |store| store.root_bytes);
-            self.bytes -= roots;
-            let gone = |loaded: &Loaded| loaded.place.store == oldest;
-            self.bytes -= self.loaded.iter().filter(|l| gone(l)).map(|l| l.bytes).sum::<u64>();
-            self.loaded.retain(|loaded| !gone(loaded));
-            self.pinned = self.pinned.min(self.loaded.len());
+            self.bytes -= self.stores.remove(&oldest).map_or(0, |store| store.root_bytes);
+            self.pantry.forget_store(oldest);
+            let bytes = &mut self.bytes;
+            self.loaded.retain_mut(|loaded| {
+                loaded.places.retain(|place| place.store != oldest);
+                if loaded.places.is_empty() {
+                    *bytes -= loaded.bytes;
+                }
+                !loaded.places.is_empty()
+            });
         }
     }
 
-    /// A new job begins: nothing is kept for the one before it.
-    pub fn begin_job(&mut self) {
-        self.pinned = 0;
+    /// A shot is over: what was fetched before its turn for it has none.
+    pub fn close_shot(&mut self, shot: ShotId) {
+        self.pantry.forget_shot(shot);
+    }
+
+    /// A new job begins: nothing is kept for the one before it, and the tiles come in that
+    /// were fetched for it or for frames before.
+    pub fn begin_job(&mut self, shot: ShotId, frame: FrameIndex) {
         self.awaited.clear();
+        self.loaded.iter_mut().for_each(|loaded| loaded.pinned = false);
+        self.stores.values().for_each(|store| store.resident.next_round());
+        for (places, tile) in self.pantry.take_due(Due { shot, frame }) {
+            // A tile that is no good there is found out when a job asks for it.
+            let _unfit = self.insert(places, &tile, false);
+        }
         self.trim();
+        if self.pantry.lacks_room() {
+            self.make_room_ahead();
+        }
     }
 
     /// The terrain as a job sees it now.
@@ -147,33 +184,98 @@ impl<P> Terrain<P> {
         hashes
     }
 
-    /// Puts a tile wherever it is awaited; one that nobody awaits is dropped. Says what is wrong if it does not belong there.
-    pub fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Result<(), String> {
-        let mut bytes = tile.memory_bytes() as u64;
-        for place in self.awaited.remove(&hash).unwrap_or_default() {
-            let Some(store) = self.stores.get_mut(&place.store) else { continue };
-            // No job looks at the tiles now, so nothing is copied here, except after a
-            // lost connection while its last job winds up.
-            if !Arc::make_mut(&mut store.resident).insert(place.key, tile.clone()) {
-                return Err(format!("it is no tile for {:?}", place.key));
-            }
-            // The places share one tile.
-            let bytes = std::mem::take(&mut bytes);
-            self.bytes += bytes;
-            if store.roots.binary_search(&place.key).is_ok() {
-                store.root_bytes += bytes;
-            } else {
-                self.loaded.push_back(Loaded { place, bytes });
-                self.pinned += 1;
+    /// Notes that tiles will be needed by a frame of a shot; the hashes of those that are
+    /// not in memory, each once.
+    pub fn foresee_tiles(
+        &mut self,
+        store: BlobHash,
+        (shot, frame): (ShotId, FrameIndex),
+        keys: &[TileKey],
+    ) -> Vec<BlobHash> {
+        let Some(known) = self.stores.get(&store) else { return Vec::new() };
+        let mut hashes = Vec::new();
+        for &key in keys.iter().filter(|key| !known.resident.is_loaded(**key)) {
+            let Some(entry) = known.resident.index().entry(key) else { continue };
+            if self.pantry.foresee(entry.hash, Place { store, key }, Due { shot, frame }) {
+                hashes.push(entry.hash);
             }
         }
+        hashes.sort_unstable();
+        hashes.dedup();
+        hashes
+    }
+
+    /// Whether there is room for one more tile before its turn.
+    pub fn has_room_ahead(&mut self) -> bool {
+        let free = self.limit_bytes.saturating_sub(self.bytes);
+        self.pantry.has_room(free)
+    }
+
+    /// Keeps a tile until its turn; drops it if there is no room, or if nobody foresaw it.
+    pub fn stow(&mut self, hash: BlobHash, tile: Tile) {
+        let free = self.limit_bytes.saturating_sub(self.bytes);
+        self.pantry.stow(hash, tile, free);
+    }
+
+    /// A tile that a job waits for and that was fetched before its turn.
+    pub fn take_stowed(&mut self, hash: BlobHash) -> Option<Tile> {
+        self.pantry.take(hash)
+    }
+
+    /// A tile that was foreseen is on disk, and stays there until its turn.
+    pub fn leave_on_disk(&mut self, hash: BlobHash) {
+        self.pantry.give_up(hash);
+    }
+
+    /// Puts a tile wherever it is awaited; one that nobody awaits is dropped. Says what is
+    /// wrong if it does not belong there.
+    pub fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Result<(), String> {
+        let places = self.awaited.remove(&hash).unwrap_or_default();
+        let added = self.insert(places, tile, true);
         self.trim();
-        Ok(())
+        added
+    }
+
+    fn insert(&mut self, places: Vec<Place>, tile: &Tile, pinned: bool) -> Result<(), String> {
+        // The places share one tile.
+        let bytes = tile.memory_bytes() as u64;
+        let mut loaded = Loaded { places: Vec::new(), bytes, pinned };
+        let mut outcome = Ok(());
+        let mut is_root = false;
+        for place in places {
+            let Some(store) = self.stores.get_mut(&place.store) else { continue };
+            if store.resident.is_loaded(place.key) {
+                continue;
+            }
+            // No job looks at the tiles now, so nothing is copied here, except while a
+            // scout does, or after a lost connection while its last job winds up.
+            if !Arc::make_mut(&mut store.resident).insert(place.key, tile.clone()) {
+                outcome = Err(format!("it is no tile for {:?}", place.key));
+                break;
+            }
+            if store.roots.binary_search(&place.key).is_ok() {
+                if !std::mem::replace(&mut is_root, true) {
+                    store.root_bytes += bytes;
+                }
+            } else {
+                loaded.places.push(place);
+            }
+        }
+        if is_root || !loaded.places.is_empty() {
+            self.bytes += bytes;
+        }
+        if !loaded.places.is_empty() {
+            // A root's bytes are counted with its store.
+            loaded.bytes = if is_root { 0 } else { bytes };
+            self.loaded.push(loaded);
+        }
+        outcome
     }
 
     /// A tile cannot be had.
     pub fn give_up(&mut self, hash: BlobHash) {
         self.awaited.remove(&hash);
+        self.pantry.give_up(hash);
     }
 
     /// Whether the tiles of the present job alone take more than the limit, in words.
@@ -189,169 +291,66 @@ impl<P> Terrain<P> {
         })
     }
 
-    /// Forgets the oldest tiles that the present job has not asked for.
+    /// Forgets the tiles unused longest that the present job has not asked for, until the
+    /// rest is within the limit. Tiles before their turn go before those that jobs use.
     fn trim(&mut self) {
-        while self.bytes > self.limit_bytes && self.loaded.len() > self.pinned {
-            let Some(oldest) = self.loaded.pop_front() else { return };
-            self.bytes -= oldest.bytes;
-            if let Some(store) = self.stores.get_mut(&oldest.place.store) {
-                Arc::make_mut(&mut store.resident).remove(oldest.place.key);
+        if self.bytes() <= self.limit_bytes {
+            return;
+        }
+        let goal = self.limit_bytes - self.limit_bytes / SLACK_PART;
+        for (age, number) in self.by_age() {
+            while age < UNUSED_JOBS && self.bytes() > self.limit_bytes && self.pantry.drop_last() {}
+            let enough = if age < UNUSED_JOBS { self.limit_bytes } else { goal };
+            if self.bytes() <= enough {
+                break;
+            }
+            self.forget(number);
+        }
+        while self.bytes() > self.limit_bytes && self.pantry.drop_last() {}
+        self.loaded.retain(|loaded| !loaded.places.is_empty());
+    }
+
+    /// Forgets tiles that no job has looked at for long, until tiles before their turn have
+    /// the room that they may take.
+    fn make_room_ahead(&mut self) {
+        let goal = self.limit_bytes - self.limit_bytes / PANTRY_PART;
+        if self.bytes <= goal {
+            return;
+        }
+        for (_, number) in self.by_age().into_iter().take_while(|(age, _)| *age >= UNUSED_JOBS) {
+            if self.bytes <= goal {
+                break;
+            }
+            self.forget(number);
+        }
+        self.loaded.retain(|loaded| !loaded.places.is_empty());
+    }
+
+    /// The tiles that the present job has not asked for: jobs since they were used and
+    /// place in the list, those unused longest first.
+    fn by_age(&self) -> Vec<(u32, usize)> {
+        let age = |place: &Place| {
+            self.stores.get(&place.store).map_or(u32::MAX, |store| store.resident.age(place.key))
+        };
+        let free = self.loaded.iter().enumerate().filter(|(_, loaded)| !loaded.pinned);
+        let mut aged: Vec<_> = free
+            .map(|(number, loaded)| (loaded.places.iter().map(age).min().unwrap_or(0), number))
+            .collect();
+        aged.sort_unstable_by(|(age_a, a), (age_b, b)| age_b.cmp(age_a).then(a.cmp(b)));
+        aged
+    }
+
+    /// Forgets one tile of the list, and leaves an entry without a place there.
+    fn forget(&mut self, number: usize) {
+        let loaded = &mut self.loaded[number];
+        self.bytes -= loaded.bytes;
+        for place in loaded.places.drain(..) {
+            if let Some(store) = self.stores.get_mut(&place.store) {
+                Arc::make_mut(&mut store.resident).remove(place.key);
             }
         }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use terrafarm_terrain::layout::*;
-    use terrafarm_terrain::resident::Lookup;
-    use terrafarm_terrain::tile::HeightTile;
-
-    const STORE: BlobHash = BlobHash([1; 32]);
-
-    /// A store of a row of tiles; the last one is the same as the first.
-    fn resident() -> Resident {
-        let count = 6;
-        let entry = |number: u32| TileEntry {
-            hash: BlobHash([10 + (number % (count - 1)) as u8; 32]),
-            length: 1,
-            min: 0.0,
-            max: 0.0,
-            ..TileEntry::EMPTY
-        };
-        let level = |count| Level { tiles: [count, 1], entries: (0..count).map(entry).collect() };
-        let layer = Layer {
-            kind: LayerKind::Height,
-            origin: [0.0; 2],
-            spacing: [1.0; 2],
-            posts: [u64::from(count) * TILE_CELLS as u64 + 1, 2],
-            levels: [6, 3, 2, 1].map(level).into(),
-        };
-        let index = StoreIndex {
-            version: STORE_VERSION,
-            crs: "LOCAL".to_owned(),
-            height_datum: HeightDatum::Unknown,
-            earth_radius_m: None,
-            layers: vec![layer],
-            report: ImportReport::default(),
-        };
-        index.check().expect("a sound index");
-        Resident::new(Arc::new(index))
-    }
-
-    fn tile() -> Tile {
-        let posts = vec![0.0; TILE_POSTS * TILE_POSTS].into_boxed_slice();
-        Tile::Height(Arc::new(HeightTile::new(posts).expect("the right number of posts")))
-    }
-
-    fn key(tx: u32) -> TileKey {
-        TileKey { layer: 0, level: 0, tx, ty: 0 }
-    }
-
-    /// Room for this many tiles.
-    fn terrain(tiles: usize) -> Terrain<()> {
-        let mut terrain = Terrain::new((tiles * tile().memory_bytes()) as u64);
-        terrain.add_store(STORE, resident(), ());
-        terrain
-    }
-
-    fn load(terrain: &mut Terrain<()>, keys: &[TileKey]) {
-        for hash in terrain.await_tiles(STORE, keys) {
-            terrain.add_tile(hash, &tile()).expect("it belongs there");
-        }
-    }
-
-    fn in_memory(terrain: &Terrain<()>) -> Vec<u32> {
-        let scene = terrain.scene(STORE).expect("the store is there");
-        let found = |tx: &u32| matches!(scene.resident.height(key(*tx)), Lookup::Found(_));
-        (0..6).filter(found).collect()
-    }
-
-    #[test]
-    fn the_oldest_tiles_go_when_the_next_job_needs_room() {
-        let mut terrain = terrain(3);
-        load(&mut terrain, &[key(0), key(1)]);
-        terrain.begin_job();
-        load(&mut terrain, &[key(2), key(3)]);
-        assert_eq!(in_memory(&terrain), [1, 2, 3]);
-        assert_eq!(terrain.bytes(), 3 * tile().memory_bytes() as u64);
-        assert_eq!(terrain.over_limit(), None);
-    }
-
-    #[test]
-    fn the_tiles_of_the_present_job_stay_and_too_many_of_them_are_told() {
-        let mut terrain = terrain(2);
-        load(&mut terrain, &[key(0), key(1), key(2)]);
-        assert_eq!(in_memory(&terrain), [0, 1, 2]);
-        assert!(terrain.over_limit().is_some_and(|why| why.contains("limit is 1 MB")));
-        terrain.begin_job();
-        assert_eq!(in_memory(&terrain), [1, 2]);
-        assert_eq!(terrain.over_limit(), None);
-    }
-
-    #[test]
-    fn a_tile_that_lies_at_two_places_is_fetched_and_counted_once() {
-        let mut terrain = terrain(9);
-        assert_eq!(terrain.await_tiles(STORE, &[key(0), key(5), key(0)]).len(), 1);
-        load(&mut terrain, &[]);
-        assert!(in_memory(&terrain).is_empty());
-        terrain.add_tile(BlobHash([10; 32]), &tile()).expect("it belongs there");
-        assert_eq!(in_memory(&terrain), [0, 5]);
-        assert_eq!(terrain.bytes(), tile().memory_bytes() as u64);
-    }
-
-    #[test]
-    fn the_root_is_loaded_with_the_first_tile_and_stays() {
-        let least = ROOTS_PART as usize * HEIGHT_TILE_BYTES.max(PHOTO_TILE_BYTES);
-        let mut terrain: Terrain<()> = Terrain::new(least as u64);
-        terrain.add_store(STORE, resident(), ());
-        let root = TileKey { layer: 0, level: 3, tx: 0, ty: 0 };
-        let is_there = |terrain: &Terrain<()>| {
-            let scene = terrain.scene(STORE).expect("the store is there");
-            matches!(scene.resident.height(root), Lookup::Found(_))
-        };
-        load(&mut terrain, &[key(1)]);
-        assert!(is_there(&terrain));
-        assert_eq!(terrain.bytes(), 2 * tile().memory_bytes() as u64);
-        assert_eq!(terrain.await_tiles(STORE, &[key(2)]).len(), 1, "it is not asked for again");
-        terrain.limit_bytes = 1;
-        terrain.begin_job();
-        assert!(in_memory(&terrain).is_empty() && is_there(&terrain));
-        assert_eq!(terrain.bytes(), tile().memory_bytes() as u64);
-        terrain.release(STORE);
-        for number in 0..IDLE_STORES_MAX {
-            let other = BlobHash([100 + number as u8; 32]);
-            terrain.add_store(other, resident(), ());
-            terrain.release(other);
-        }
-        assert_eq!(terrain.bytes(), 0);
-    }
-
-    #[test]
-    fn a_tile_that_nobody_awaits_changes_nothing() {
-        let mut terrain = terrain(9);
-        terrain.await_tiles(STORE, &[key(0)]);
-        terrain.begin_job();
-        terrain.add_tile(BlobHash([10; 32]), &tile()).expect("it is dropped");
-        assert!(in_memory(&terrain).is_empty());
-        assert_eq!(terrain.bytes(), 0);
-    }
-
-    #[test]
-    fn released_stores_stay_for_a_while_and_take_their_tiles_along_when_they_go() {
-        let mut terrain = terrain(9);
-        load(&mut terrain, &[key(0)]);
-        terrain.release(STORE);
-        assert!(terrain.has_store(STORE), "still there, and in use again");
-        terrain.release(STORE);
-        for number in 0..IDLE_STORES_MAX {
-            let other = BlobHash([100 + number as u8; 32]);
-            terrain.add_store(other, resident(), ());
-            terrain.release(other);
-        }
-        assert!(!terrain.has_store(STORE));
-        assert_eq!(terrain.bytes(), 0);
-        assert!(terrain.await_tiles(STORE, &[key(0)]).is_empty());
-    }
-}
+mod tests;

@@ -395,7 +395,10 @@ mod tests {
         let long: Message = Goodbye { reason: "x".repeat(REASON_BYTES_MAX + 1) }.into();
         assert!(matches!(encode(1, &long), Err(WireError::Unfit { .. })));
         let hashes = vec![BlobHash([0; 32]); WANT_BLOBS_MAX + 1];
-        assert!(matches!(encode(1, &WantBlobs { hashes }.into()), Err(WireError::Unfit { .. })));
+        assert!(matches!(
+            encode(1, &WantBlobs { hashes, elsewhere: true }.into()),
+            Err(WireError::Unfit { .. })
+        ));
         let huge = Blob { hash: BlobHash([0; 32]), bytes: vec![0; BLOB_BYTES_MAX + 1].into() };
         assert!(matches!(encode(1, &huge.into()), Err(WireError::TooLong { .. })));
     }
@@ -411,6 +414,6 @@ mod tests {
         let cameras = Cameras { number: u32::MAX, first, cameras: vec![camera; CAMERAS_MAX] };
         assert!(encode(1, &cameras.into()).is_ok());
         let hashes = vec![BlobHash([255; 32]); WANT_BLOBS_MAX];
-        assert!(encode(1, &WantBlobs { hashes }.into()).is_ok());
+        assert!(encode(1, &WantBlobs { hashes, elsewhere: true }.into()).is_ok());
     }
 }

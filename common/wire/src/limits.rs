@@ -46,6 +46,10 @@ pub const NAME_BYTES_MAX: usize = 256;
 pub const REASON_BYTES_MAX: usize = 2 << 10;
 /// Most blobs asked for in one message.
 pub const WANT_BLOBS_MAX: usize = 1024;
+/// Most workers named as having a blob.
+pub const ELSEWHERE_MAX: usize = 4;
+/// Most cameras told ahead: 118 bytes each.
+pub const AHEAD_CAMERAS_MAX: usize = 64;
 /// Most leases handed back in one message.
 pub const HAND_BACK_MAX: usize = 1024;
 /// Most cameras in one message.

@@ -19,7 +19,7 @@ mod trust;
 
 pub use channel::ChannelError;
 pub use handshake::{Greeting, HandshakeError, accept, greet, program};
-pub use outbox::{Outbox, OutboxEnd, Unsent, outbox};
+pub use outbox::{Meter, Outbox, OutboxEnd, Unsent, metered, outbox};
 pub use pace::Paced;
 pub use token::{FarmToken, NoRandomness, TOKEN_BYTES, TokenError};
 pub use trust::{Trust, is_this_pc};

@@ -15,7 +15,7 @@ pub mod hello;
 pub mod shot;
 pub mod work;
 
-pub use blob::{Blob, NoBlob, WantBlobs};
+pub use blob::{Blob, Elsewhere, NoBlob, Sharing, WantBlobs};
 pub use desk::{Request, Response, Verb};
 pub use hello::{Goodbye, Hello, Ping, Pong, Refusal, Refused, Role, Versions, Welcome};
 pub use shot::{
@@ -23,7 +23,7 @@ pub use shot::{
     ShotFailed, Submit, WorkerShare,
 };
 pub use work::{
-    CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Speed,
+    Ahead, CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Speed,
     Timesheet,
 };
 
@@ -236,6 +236,10 @@ messages! {
     Blob = 0x11, Blob;
     /// The answer when there is no such blob.
     NoBlob = 0x12, Control;
+    /// Coordinator to worker: the answer when others should be asked.
+    Elsewhere = 0x13, Control;
+    /// Worker to coordinator: others may ask it for blobs.
+    Sharing = 0x14, Control;
 
     /// Coordinator to worker: what the following grants belong to.
     OpenShot = 0x20, Control;
@@ -247,6 +251,8 @@ messages! {
     CloseShot = 0x23, Control;
     /// Coordinator to worker: finish what runs, hand back the rest, leave.
     Drain = 0x24, Control;
+    /// Coordinator to worker: where its cameras will be.
+    Ahead = 0x25, Control;
 
     /// Worker to coordinator: a job's pixels.
     Done = 0x30, Pixels;

@@ -12,7 +12,7 @@ use terrafarm_coordinator::api::{Access, Web, WebKey};
 use terrafarm_coordinator::queue::QueueConfig;
 use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::office::Rules;
-use terrafarm_worker::{Reconnect, WorkerConfig};
+use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig};
 use tokio::net::{TcpListener, TcpStream};
 
 const MIB: u64 = 1 << 20;
@@ -40,6 +40,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         }
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
+            redirect_above_bytes: args.share_above * MIB,
             trust,
             queue: args.data.as_deref().map(QueueConfig::new),
             scheduler: terrafarm_sched::Config { audit: args.audit, ..Default::default() },
@@ -173,6 +174,11 @@ pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
         cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
+        share: match args.share_port {
+            _ if args.no_share => ShareTiles::Never,
+            Some(port) => ShareTiles::At(port),
+            None => ShareTiles::Beyond,
+        },
         rules: Rules { hours: args.hours, polite: args.polite },
         bandwidth_bytes_per_s: args.bandwidth.map(|megabits| megabits * 1_000_000 / 8),
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },

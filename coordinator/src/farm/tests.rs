@@ -11,7 +11,7 @@ use terrafarm_common::id::BlobHash;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_wire::message::{Cameras, Failed, HandBack, RenderReport, Submit};
+use terrafarm_wire::message::{Blob, Cameras, Failed, HandBack, RenderReport, Submit, WantBlobs};
 use terrafarm_wire::pixels::Pixels;
 
 const SIZE: (u32, u32) = (64, 16);
@@ -44,7 +44,14 @@ impl Bench {
     }
 
     fn join(&mut self, peer: Peer, threads: u32) -> Vec<Out> {
-        self.event(peer, PeerEvent::Joined(Greeting { name: format!("{peer:?}"), threads }))
+        self.event(
+            peer,
+            PeerEvent::Joined(Greeting {
+                name: format!("{peer:?}"),
+                threads,
+                address: Some([127, 0, 0, 1].into()),
+            }),
+        )
     }
 
     fn gone(&mut self, peer: Peer) -> Vec<Out> {
@@ -254,14 +261,14 @@ fn terrain_goes_from_the_client_to_every_worker_that_wants_it() {
     bench.submit(4);
     let bytes = Bytes::from_static(b"tile");
     let hash = hash_of(&bytes);
-    let want = || WantBlobs { hashes: vec![hash] };
+    let want = || WantBlobs { hashes: vec![hash], elsewhere: true };
     let out = bench.say(worker(1), want());
     assert!(matches!(&out[..], [Out::Send(Peer::Client(CLIENT), Message::WantBlobs(_))]));
     assert!(bench.say(worker(2), want()).is_empty(), "asked already");
     let out = bench.say(Peer::Client(CLIENT), Blob { hash, bytes });
     assert_eq!(out.len(), 2);
     let wrong = BlobHash([9; 32]);
-    bench.say(worker(1), WantBlobs { hashes: vec![wrong] });
+    bench.say(worker(1), WantBlobs { hashes: vec![wrong], elsewhere: true });
     let out =
         bench.say(Peer::Client(CLIENT), Blob { hash: wrong, bytes: Bytes::from_static(b"x") });
     assert!(matches!(&out[..], [Out::Send(Peer::Worker(_), Message::NoBlob(_))]), "{out:?}");
@@ -360,7 +367,7 @@ fn a_liar_is_found_out_by_audits_and_what_comes_later_is_right() {
     assert!(bench.farm.scheduler.account().audited > 0);
     // It comes back under its name, and is known.
     bench.gone(worker(2));
-    let back = Greeting { name: format!("{:?}", worker(2)), threads: 1 };
+    let back = Greeting { name: format!("{:?}", worker(2)), threads: 1, address: None };
     bench.event(worker(9), PeerEvent::Joined(back));
     assert!(bench.farm.scheduler.is_distrusted(WorkerId(9)));
 }
@@ -375,4 +382,103 @@ fn where_all_render_the_same_audits_change_nothing() {
     let account = bench.farm.scheduler.account();
     assert!(account.audited > account.accepted / 2, "{account:?}");
     assert!(bench.farm.shots.iter().next().is_none(), "the shot is over");
+}
+
+#[test]
+fn workers_are_told_where_the_camera_will_be_now_and_then() {
+    let mut bench = Bench::new();
+    bench.submit(600);
+    let mut told = Vec::new();
+    let mut out = bench.join(worker(1), 4);
+    while !out.is_empty() {
+        let mut next = Vec::new();
+        for one in &out {
+            match one {
+                Out::Send(_, Message::Ahead(ahead)) => told.push(ahead.clone()),
+                Out::SendFrame(_, head, _) => {
+                    let frame = head.clone().with(Pixels::raw(Bytes::new()).unwrap());
+                    let taken = terrafarm_wire::message::FrameTaken {
+                        shot: frame.shot,
+                        frame: frame.frame,
+                    };
+                    next.extend(bench.say(Peer::Client(CLIENT), taken));
+                }
+                _ => {}
+            }
+        }
+        for (worker, grant) in grants(&out) {
+            let told_until = told
+                .last()
+                .map_or(0, |ahead| ahead.first + ahead.stride * ahead.cameras.len() as u32);
+            assert!(grant.frame < told_until.max(1) || told_until >= 592, "{}", grant.frame);
+            next.extend(bench.say(Peer::Worker(worker), done(&grant)));
+        }
+        out = next;
+    }
+    assert!((4..=6).contains(&told.len()), "told {} times", told.len());
+    assert_eq!((told[0].first, told[0].stride, told[0].cameras.len()), (8, 8, 32));
+    assert!(told.iter().all(|ahead| ahead.first + 8 * (ahead.cameras.len() as u32 - 1) < 600));
+}
+
+/// Blobs that a worker is sent, and where it is sent for others.
+fn terrain(out: &[Out], to: Peer) -> (usize, Vec<std::net::SocketAddr>) {
+    let messages = out.iter().filter_map(|out| match out {
+        Out::Send(peer, message) if *peer == to => Some(message),
+        _ => None,
+    });
+    let (mut blobs, mut elsewhere) = (0, Vec::new());
+    for message in messages {
+        match message {
+            Message::Blob(_) => blobs += 1,
+            Message::Elsewhere(message) => elsewhere.extend(&message.workers),
+            _ => {}
+        }
+    }
+    (blobs, elsewhere)
+}
+
+#[test]
+fn workers_are_sent_to_each_other_when_more_terrain_waits_than_may() {
+    let mut bench = Bench::new();
+    bench.submit(9);
+    bench.farm.redirect_above(1000);
+    (1..=3).for_each(|number| drop(bench.join(worker(number), 1)));
+    let (bytes, hash) = (Bytes::from_static(b"a tile"), hash_of(b"a tile"));
+    let want = |elsewhere| WantBlobs { hashes: vec![hash], elsewhere };
+    bench.say(worker(1), want(true));
+    bench.say(Peer::Client(CLIENT), Blob { hash, bytes });
+    bench.say(worker(1), terrafarm_wire::message::Sharing { port: 4711 });
+    let out = bench.say(worker(2), want(true));
+    assert_eq!(terrain(&out, worker(2)), (1, vec![]), "the links are free");
+    bench.farm.set_unsent(1000);
+    let out = bench.say(worker(3), want(true));
+    assert_eq!(terrain(&out, worker(3)), (0, vec!["127.0.0.1:4711".parse().unwrap()]));
+    let out = bench.say(worker(3), want(false));
+    assert_eq!(terrain(&out, worker(3)), (1, vec![]), "it insists");
+    let out = bench.say(worker(1), want(true));
+    assert_eq!(terrain(&out, worker(1)), (1, vec![]), "nobody is sent to itself");
+    bench.gone(worker(1));
+    let out = bench.say(worker(2), want(true));
+    assert_eq!(terrain(&out, worker(2)), (1, vec![]), "who has it is gone");
+}
+
+#[test]
+fn workers_of_other_pcs_are_not_sent_to_a_port_of_this_one() {
+    let mut bench = Bench::new();
+    bench.submit(9);
+    bench.farm.redirect_above(0);
+    bench.join(worker(1), 1);
+    let address = Some([10, 0, 0, 7].into());
+    bench.event(worker(2), PeerEvent::Joined(Greeting { name: "far".into(), threads: 1, address }));
+    let (bytes, hash) = (Bytes::from_static(b"a tile"), hash_of(b"a tile"));
+    let want = WantBlobs { hashes: vec![hash], elsewhere: true };
+    for number in [1, 2] {
+        bench.say(worker(number), terrafarm_wire::message::Sharing { port: 4711 });
+    }
+    bench.say(worker(1), want.clone());
+    bench.say(Peer::Client(CLIENT), Blob { hash, bytes });
+    let out = bench.say(worker(2), want.clone());
+    assert_eq!(terrain(&out, worker(2)), (1, vec![]));
+    let out = bench.say(worker(1), want);
+    assert_eq!(terrain(&out, worker(1)), (0, vec!["10.0.0.7:4711".parse().unwrap()]));
 }

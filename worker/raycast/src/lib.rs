@@ -24,7 +24,7 @@
 //! `walk` their rays over it, many at a time in the `lanes` of the processor; `lod` casts a
 //! ray for each pixel, `column` along the lines of `lattice`. `frustum` and `voxel` stand
 //! alone. `progress` turns a region into pixels and `shade` what was seen into colours;
-//! `sight` answers without colours, `at_hand` without waiting for tiles, and [`meter`] measures how far an answer is from that
+//! `sight` answers without colours, `at_hand` without waiting for tiles, `scout` names tiles early, and [`meter`] measures how far an answer is from that
 //! of `exact`.
 //!
 //! Every PC computes the same bytes: no platform sine, exponential or power and no fused
@@ -52,6 +52,7 @@ mod progress;
 mod pyramid;
 mod reference;
 mod relief;
+mod scout;
 mod seen;
 mod shade;
 mod sight;
@@ -65,6 +66,7 @@ pub use at_hand::{Glimpse, render_at_hand};
 pub use lanes::Width;
 pub use progress::{Progress, Rendered, Stats};
 pub use pyramid::Pyramid;
+pub use scout::scout;
 pub use seen::Unfit;
 pub use shade::shade;
 pub use sight::{AtHand, Depths, Hit, Missing, Unseen, cast, depths, depths_at_hand, trace};

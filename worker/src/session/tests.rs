@@ -10,7 +10,9 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_wire::message::{CloseShot, Drain, RenderReport, Revoke, Timesheet};
+use terrafarm_wire::message::{
+    Ahead, CloseShot, Drain, RenderReport, Revoke, Timesheet, WantBlobs,
+};
 use terrafarm_wire::pixels::Pixels;
 
 const INDEX: BlobHash = BlobHash([1; 32]);
@@ -40,6 +42,16 @@ fn grant(lease: u64, shot: u64) -> Event {
     let region = Region::whole(8, 4);
     let (lease, shot) = (LeaseId(lease), ShotId(shot));
     Event::Received(Grant { lease, shot, frame: 0, region, camera }.into())
+}
+
+fn ahead(shot: u64, first: u32, cameras: usize) -> Event {
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, (8, 4));
+    let cameras = vec![camera; cameras];
+    Event::Received(Ahead { shot: ShotId(shot), first, stride: 10, cameras }.into())
+}
+
+fn elsewhere(hash: BlobHash) -> Event {
+    Event::Received(Elsewhere { hash, workers: vec!["10.0.0.7:1".parse().unwrap()] }.into())
 }
 
 fn revoke(lease: u64) -> Event {
@@ -78,6 +90,11 @@ fn short(action: &Action) -> String {
         Action::Resume(lease) => format!("resume {lease}"),
         Action::Stop(lease) => format!("stop {lease}"),
         Action::Discard(lease) => format!("discard {lease}"),
+        Action::Seek(hash) => format!("seek {hash}"),
+        Action::Stock(blob) => format!("stock {}", blob.hash),
+        Action::Fetch(elsewhere) => format!("fetch {}", elsewhere.hash),
+        Action::Glance(glance, _) => format!("glance {} {}", glance.shot, glance.due),
+        Action::Close(shot) => format!("close {shot}"),
         Action::Release(_) => "release".to_owned(),
         Action::End => "end".to_owned(),
     }
@@ -88,7 +105,9 @@ fn rendering() -> Session {
     let mut session = Session::new();
     let wants = after(&mut session, [open(1), grant(1, 1), grant(2, 1)]);
     assert_eq!(wants, [format!("load {INDEX}")]);
-    assert_eq!(after(&mut session, [Event::Loaded(INDEX)]), ["start lease-1"]);
+    let wants = after(&mut session, [Event::Loaded(INDEX)]);
+    assert_eq!(wants, ["start lease-1", "glance shot-1 0"]);
+    assert!(after(&mut session, [Event::Glanced(Vec::new())]).is_empty());
     session
 }
 
@@ -186,7 +205,7 @@ fn the_same_lease_twice_is_one_job() {
 fn a_closed_shot_gives_its_waiting_grants_back_and_its_store_free() {
     let mut session = rendering();
     let close = Event::Received(CloseShot { shot: ShotId(1) }.into());
-    assert_eq!(after(&mut session, [close]), ["hand back 1", "release"]);
+    assert_eq!(after(&mut session, [close]), ["hand back 1", "close shot-1", "release"]);
     assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
 }
 
@@ -194,7 +213,8 @@ fn a_closed_shot_gives_its_waiting_grants_back_and_its_store_free() {
 fn a_slow_link_holds_rendering_back() {
     let mut session = rendering();
     assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
-    assert!(after(&mut session, [grant(3, 1)]).is_empty(), "not before the first is sent");
+    let wants = after(&mut session, [grant(3, 1)]);
+    assert_eq!(wants, ["glance shot-1 0"], "no job before the first is sent");
     assert_eq!(after(&mut session, [Event::Sent]).len(), 1);
 }
 
@@ -234,6 +254,94 @@ fn thousands_of_missing_tiles_are_asked_for_a_few_at_a_time() {
     }
 }
 
+#[test]
+fn the_way_ahead_is_looked_at_view_by_view_and_fetched_a_few_at_a_time() {
+    let mut session = rendering();
+    assert_eq!(after(&mut session, [ahead(1, 5, 3)]), ["glance shot-1 0"]);
+    let foreseen: Vec<_> = (0..6).map(tile).collect();
+    let seek: Vec<_> = foreseen.iter().map(|hash| format!("seek {hash}")).collect();
+    assert_eq!(after(&mut session, [Event::Glanced(foreseen.clone())]), seek[..EARLY_MAX]);
+    // The first is asked for, the second is here.
+    assert_eq!(after(&mut session, [Event::Absent(tile(0))]), ["want 1"]);
+    assert_eq!(after(&mut session, [Event::Stocked(tile(1))]), seek[4..5]);
+    let stock = after(&mut session, [Event::Received(blob(tile(0)).into())]);
+    assert_eq!(stock, [format!("stock {}", tile(0))]);
+    let wants = after(&mut session, [Event::Stocked(tile(0))]);
+    assert_eq!(wants, [seek[5].clone(), "glance shot-1 5".to_owned()], "the next view");
+    for number in 2..6 {
+        assert!(after(&mut session, [Event::Stocked(tile(number))]).is_empty());
+    }
+    assert_eq!(after(&mut session, [Event::Glanced(foreseen)]), ["glance shot-1 15"], "all here");
+    assert!(after(&mut session, [Event::Glanced(Vec::new())]).is_empty());
+    // Only what is new of a later message is looked at: frame 35 and 45.
+    assert_eq!(after(&mut session, [ahead(1, 15, 4)]), ["glance shot-1 25"]);
+    assert_eq!(after(&mut session, [Event::Glanced(Vec::new())]), ["glance shot-1 35"]);
+    assert!(after(&mut session, [Event::Glanced(Vec::new())]).is_empty());
+}
+
+#[test]
+fn what_a_job_waits_for_goes_first_and_what_is_on_its_way_is_not_asked_again() {
+    let mut session = rendering();
+    after(&mut session, [ahead(1, 5, 1)]);
+    after(&mut session, [Event::Glanced((0..3).map(tile).collect())]);
+    assert_eq!(after(&mut session, [Event::Absent(tile(0))]), ["want 1"]);
+    let wants = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(0), tile(1), tile(9)])]);
+    assert_eq!(wants, [format!("load {}", tile(9))], "two are on their way");
+    assert!(after(&mut session, [Event::Absent(tile(2))]).is_empty(), "not now");
+    assert_eq!(after(&mut session, [Event::Absent(tile(1))]), ["want 1"], "a job waits for it");
+    let taken = after(&mut session, [Event::Received(blob(tile(0)).into())]);
+    assert_eq!(taken, [format!("take {}", tile(0))]);
+    after(&mut session, [Event::Loaded(tile(0)), Event::Loaded(tile(9))]);
+    after(&mut session, [Event::Received(blob(tile(1)).into())]);
+    let wants = after(&mut session, [Event::Loaded(tile(1))]);
+    assert_eq!(wants, ["resume lease-1", "want 1"], "now for the rest");
+}
+
+#[test]
+fn without_room_nothing_is_fetched_before_its_turn_until_the_next_job() {
+    let mut session = rendering();
+    after(&mut session, [ahead(1, 5, 2)]);
+    after(&mut session, [Event::Glanced((0..9).map(tile).collect())]);
+    for number in 0..4 {
+        assert!(after(&mut session, [Event::NoRoom(tile(number))]).is_empty());
+    }
+    after(&mut session, [Event::Rendered(done(1)), Event::Sent]);
+    let wants = after(&mut session, [Event::Loaded(INDEX)]);
+    assert_eq!(wants, ["start lease-2", "glance shot-1 5"]);
+}
+
+#[test]
+fn other_workers_are_asked_and_the_coordinator_if_they_fail() {
+    let mut session = rendering();
+    let both = vec![tile(1), tile(2)];
+    after(&mut session, [Event::Paused(LeaseId(1), both)]);
+    after(&mut session, [Event::Absent(tile(1)), Event::Absent(tile(2))]);
+    let fetch = |number| [format!("fetch {}", tile(number))];
+    assert_eq!(after(&mut session, [elsewhere(tile(1))]), fetch(1));
+    assert_eq!(after(&mut session, [elsewhere(tile(2))]), fetch(2));
+    let taken = after(&mut session, [Event::Fetched(blob(tile(1)))]);
+    assert_eq!(taken, [format!("take {}", tile(1))]);
+    session.handle(Event::Unfetched(tile(2)));
+    let want: Message = WantBlobs { hashes: vec![tile(2)], elsewhere: false }.into();
+    assert_eq!(session.poll_action(), Some(Action::Send(want)));
+}
+
+#[test]
+fn damaged_blobs_are_asked_for_again_and_not_for_ever() {
+    let mut session = rendering();
+    after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1)]), Event::Absent(tile(1))]);
+    for _ in 0..2 {
+        let taken = after(&mut session, [Event::Received(blob(tile(1)).into())]);
+        assert_eq!(taken, [format!("take {}", tile(1))]);
+        session.handle(Event::Damaged(tile(1)));
+        let want: Message = WantBlobs { hashes: vec![tile(1)], elsewhere: false }.into();
+        assert_eq!(session.poll_action(), Some(Action::Send(want)));
+    }
+    after(&mut session, [Event::Received(blob(tile(1)).into())]);
+    let said = after(&mut session, [Event::Damaged(tile(1))]);
+    assert!(said[1].ends_with("what came has another hash"), "{said:?}");
+}
+
 /// A world that answers in any order, and keeps the rules in view.
 #[derive(Default)]
 struct World {
@@ -242,7 +350,14 @@ struct World {
     answered: BTreeSet<u64>,
     memory: BTreeSet<BlobHash>,
     loading: Vec<BlobHash>,
+    /// Looked for, or being kept, for later.
+    early: Vec<BlobHash>,
+    /// Those of them for which a job came to wait.
+    hurried: BTreeSet<BlobHash>,
     asked: Vec<BlobHash>,
+    /// Asked of other workers.
+    fetching: Vec<BlobHash>,
+    glancing: bool,
     running: Option<u64>,
     paused: Option<u64>,
     needs: BTreeSet<BlobHash>,
@@ -255,7 +370,28 @@ impl World {
         while let Some(action) = session.poll_action() {
             assert!(!self.ended, "{action:?} after the end");
             match action {
-                Action::Send(message) => self.hear(&message),
+                Action::Send(message) => {
+                    if let (Message::WantBlobs(want), Doing::Waiting) = (&message, session.doing())
+                    {
+                        let needed = |hash| self.needs.contains(hash) || *hash == INDEX;
+                        assert!(want.hashes.iter().all(needed), "for later while a job waits");
+                    }
+                    self.hear(&message);
+                }
+                Action::Seek(hash) => {
+                    assert!(!self.loading.contains(&hash) && !self.early.contains(&hash));
+                    self.early.push(hash);
+                    assert!(self.early.len() - self.hurried.len() <= EARLY_MAX);
+                }
+                Action::Stock(blob) => self.early.push(blob.hash),
+                Action::Fetch(elsewhere) => {
+                    assert!(self.fetching.contains(&elsewhere.hash));
+                }
+                Action::Glance(glance, shot) => {
+                    assert!(self.memory.contains(&shot.index) && shot.shot == glance.shot);
+                    assert!(!std::mem::replace(&mut self.glancing, true), "one at a time");
+                }
+                Action::Close(_) => {}
                 Action::Load(hash) => {
                     assert!(!self.loading.contains(&hash), "loaded twice");
                     self.loading.push(hash);
@@ -336,6 +472,7 @@ impl World {
             14 => from_pool(self).map(|lease| {
                 self.paused = Some(lease.0);
                 self.needs = (0..1 + pick % 4).map(|i| tile(i + pick % 16)).collect();
+                self.hurried.extend(self.early.iter().filter(|hash| self.needs.contains(hash)));
                 self.needs.iter().for_each(|hash| {
                     self.memory.remove(hash);
                 });
@@ -348,6 +485,23 @@ impl World {
                 Some(Event::Sent)
             }
             20 if pick < 8 => Some(Event::Leave("told".into())),
+            21 => Some(ahead(1 + u64::from(pick % 3), u32::from(pick), 1 + usize::from(pick % 4))),
+            22 | 23 if self.glancing => {
+                self.glancing = false;
+                Some(Event::Glanced((0..pick % 12).map(|i| tile(i + pick % 16)).collect()))
+            }
+            24..=26 => pick_of(&mut self.early).map(|hash| {
+                self.hurried.remove(&hash);
+                [Event::Stocked(hash), Event::Absent(hash), Event::NoRoom(hash)][kind as usize - 24]
+                    .clone()
+            }),
+            27 => pick_of(&mut self.asked).map(|hash| {
+                self.fetching.push(hash);
+                elsewhere(hash)
+            }),
+            28 => pick_of(&mut self.fetching).map(|hash| Event::Fetched(blob(hash))),
+            29 => pick_of(&mut self.fetching).map(Event::Unfetched),
+            30 => pick_of(&mut self.loading).map(Event::Damaged),
             _ => None,
         }
     }
@@ -358,7 +512,7 @@ proptest! {
 
     #[test]
     fn whatever_happens_every_lease_is_answered_once_and_one_job_runs(
-        script in prop::collection::vec((0u8..=20, any::<u8>()), 0..150),
+        script in prop::collection::vec((0u8..=30, any::<u8>()), 0..200),
     ) {
         let (mut session, mut world, mut lease) = (Session::new(), World::default(), 0);
         session.handle(open(1));
@@ -377,7 +531,7 @@ proptest! {
             world.carry_out(&mut session);
         }
         for _ in 0..2000 {
-            for kind in [7, 11, 15, 18] {
+            for kind in [7, 11, 15, 18, 24, 28] {
                 if let Some(event) = world.event(kind, 0, &mut lease) {
                     session.handle(event);
                     world.carry_out(&mut session);

@@ -51,6 +51,7 @@ pub struct BlobCache {
     folder: PathBuf,
     limit_bytes: u64,
     account: Mutex<Account>,
+    damaged: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -76,7 +77,12 @@ impl BlobCache {
     /// If the folder cannot be made or read.
     pub fn open(folder: &Path, limit_bytes: u64) -> Result<BlobCache, CacheError> {
         fs::create_dir_all(folder).map_err(|source| io_error(folder, source))?;
-        let cache = BlobCache { folder: folder.to_owned(), limit_bytes, account: Mutex::default() };
+        let cache = BlobCache {
+            folder: folder.to_owned(),
+            limit_bytes,
+            account: Mutex::default(),
+            damaged: AtomicU64::new(0),
+        };
         cache.trim(&mut cache.lock())?;
         Ok(cache)
     }
@@ -91,6 +97,11 @@ impl BlobCache {
         self.lock().total_bytes
     }
 
+    /// Blobs that were found damaged.
+    pub fn damaged(&self) -> u64 {
+        self.damaged.load(Ordering::Relaxed)
+    }
+
     /// A blob, if it is here and sound. A damaged one is removed.
     pub fn get(&self, hash: &BlobHash) -> Option<Vec<u8>> {
         let path = self.path_of(hash);
@@ -100,6 +111,7 @@ impl BlobCache {
         let whole = length <= self.limit_bytes
             && file.take(self.limit_bytes).read_to_end(&mut bytes).ok()? as u64 == length;
         if !whole || hash_of(&bytes) != *hash {
+            self.damaged.fetch_add(1, Ordering::Relaxed);
             // Another process may have put a sound one in its place meanwhile; it will be
             // fetched again, which is harmless.
             if fs::remove_file(&path).is_ok() {
@@ -111,6 +123,16 @@ impl BlobCache {
         // Without the right to change times the cache still works, by age.
         let _ = touch(&path, self.next_use());
         Some(bytes)
+    }
+
+    /// Length of a blob that is here, bytes, as far as one can tell without reading it.
+    pub fn length(&self, hash: &BlobHash) -> Option<u64> {
+        fs::metadata(self.path_of(hash)).ok().filter(|there| there.is_file()).map(|it| it.len())
+    }
+
+    /// Whether a blob is here, as far as one can tell without reading it. It counts as used.
+    pub fn holds(&self, hash: &BlobHash) -> bool {
+        self.length(hash).is_some() && touch(&self.path_of(hash), self.next_use()).is_ok()
     }
 
     /// Keeps a blob, removing those unused longest if space is needed. One that is larger
@@ -320,6 +342,7 @@ mod tests {
             assert_eq!(cache.get(&hash), None);
             assert!(!path.exists());
         }
+        assert_eq!(cache.damaged(), 4);
         cache.put(&hash, &bytes).unwrap();
         assert_eq!(cache.get(&hash), Some(bytes));
     }

@@ -146,21 +146,24 @@ impl Resident {
         self.uses.round.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// For how many rounds a tile has not been used; 0 if it was in this one.
+    pub fn age(&self, key: TileKey) -> u32 {
+        let round = self.uses.round.load(Ordering::Relaxed);
+        let last = self.position(key).map_or(0, |at| {
+            let last = &self.uses.last[usize::from(key.layer)][usize::from(key.level)][at];
+            last.load(Ordering::Relaxed)
+        });
+        round.wrapping_sub(last)
+    }
+
     /// Forgets the tiles unused for most rounds until the rest takes at most so many
     /// bytes; of equal age, those first in the order of keys. Returns what went.
     pub fn evict_to(&mut self, bytes: usize) -> Vec<TileKey> {
         if self.bytes <= bytes {
             return Vec::new();
         }
-        let round = self.uses.round.load(Ordering::Relaxed);
-        let mut loaded: Vec<(u32, TileKey)> = self
-            .loaded()
-            .map(|key| {
-                let at = self.position(key).expect("a loaded tile has a place");
-                let last = &self.uses.last[usize::from(key.layer)][usize::from(key.level)][at];
-                (round.wrapping_sub(last.load(Ordering::Relaxed)), key)
-            })
-            .collect();
+        let mut loaded: Vec<(u32, TileKey)> =
+            self.loaded().map(|key| (self.age(key), key)).collect();
         loaded.sort_unstable_by(|(age_a, a), (age_b, b)| age_b.cmp(age_a).then(a.cmp(b)));
         let mut evicted = Vec::new();
         for (_, key) in loaded {

@@ -33,16 +33,82 @@ async fn a_tile_that_nobody_has_fails_the_job_with_the_reason() {
 }
 
 #[tokio::test]
-async fn bytes_that_are_not_what_was_asked_for_fail_the_job() {
+async fn bytes_that_are_not_what_was_asked_for_are_asked_for_again() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let folder = tempfile::tempdir().unwrap();
+    let _running = start(coordinator.config(Some(folder.path())));
+    let mut peer = coordinator.welcome().await;
+    peer.send(terrain.open(1, 1)).await;
+    let job = grant(1, 1, whole());
+    peer.send(job).await;
+    // Each blob comes torn once.
+    let mut torn = std::collections::BTreeSet::new();
+    let done = loop {
+        match peer.recv().await {
+            Some(Message::WantBlobs(want)) => {
+                for hash in want.hashes {
+                    let mut bytes = terrain.blobs[&hash].clone();
+                    let first = torn.insert(hash);
+                    assert_eq!(want.elsewhere, first, "the coordinator itself, the second time");
+                    if first {
+                        let middle = bytes.len() / 2;
+                        bytes[middle] ^= 0x10;
+                    }
+                    peer.send(Blob { hash, bytes: bytes.into() }).await;
+                }
+            }
+            Some(Message::Done(done)) => break done,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(torn.len() >= 2, "the index and a tile");
+    let pixels = done.pixels.unpack(whole().area() as usize * 3).unwrap();
+    assert!(pixels == terrain.expected(&job, 1));
+}
+
+#[tokio::test]
+async fn a_bit_that_flips_in_the_cache_is_found_and_its_tile_fetched_again() {
+    let terrain = Terrain::new();
+    let folder = tempfile::tempdir().unwrap();
+    let coordinator = Coordinator::new().await;
+    let job = grant(1, 1, whole());
+    for first in [true, false] {
+        let running = start(coordinator.config(Some(folder.path())));
+        let mut peer = coordinator.welcome().await;
+        peer.send(terrain.open(1, 1)).await;
+        peer.send(job).await;
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        let pixels = done.pixels.unpack(whole().area() as usize * 3).unwrap();
+        assert!(pixels == terrain.expected(&job, 1));
+        running.stop.send(()).unwrap();
+        assert!(matches!(peer.recv().await, Some(Message::Goodbye(_))));
+        running.ended.await.unwrap().unwrap();
+        let files: Vec<_> =
+            std::fs::read_dir(folder.path()).unwrap().map(|file| file.unwrap().path()).collect();
+        assert!(files.len() >= 2 && peer.asked.len() == files.len(), "each one again");
+        for file in files.iter().filter(|_| first) {
+            let mut bytes = std::fs::read(file).unwrap();
+            let middle = bytes.len() / 2;
+            bytes[middle] ^= 1;
+            std::fs::write(file, bytes).unwrap();
+        }
+    }
+}
+
+#[tokio::test]
+async fn bytes_that_are_never_what_was_asked_for_fail_the_job() {
     let terrain = Terrain::new();
     let coordinator = Coordinator::new().await;
     let _running = start(coordinator.config(None));
     let mut peer = coordinator.welcome().await;
     peer.send(terrain.open(1, 1)).await;
     peer.send(grant(1, 1, whole())).await;
-    let Some(Message::WantBlobs(want)) = peer.recv().await else { panic!("no question") };
-    let hash = want.hashes[0];
-    peer.send(Blob { hash, bytes: b"something else"[..].into() }).await;
+    for _ in 0..3 {
+        let Some(Message::WantBlobs(want)) = peer.recv().await else { panic!("no question") };
+        let hash = want.hashes[0];
+        peer.send(Blob { hash, bytes: b"something else"[..].into() }).await;
+    }
     let reason = reason(peer.recv().await);
     assert!(reason.ends_with("what came has another hash"), "{reason}");
 }

@@ -8,5 +8,7 @@ mod script;
 
 /// What breaks and what must happen then.
 mod faults;
+/// Terrain before its turn, and from worker to worker.
+mod peers;
 /// Jobs, terrain, pixels, and leaving.
 mod work;

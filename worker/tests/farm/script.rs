@@ -9,11 +9,13 @@ use terrafarm_common::region::Region;
 use terrafarm_raycast::{Rendered, Stats, Unfit, Unseen, View};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_wire::Message;
-use terrafarm_wire::link::{Connection, Trust, accept};
+use terrafarm_wire::link::{Connection, FarmToken, Trust, accept};
 use terrafarm_wire::message::{Blob, Hello, NoBlob, WantBlobs};
 use terrafarm_worker::office::Rules;
 use terrafarm_worker::render::Scene;
-use terrafarm_worker::{Caster, Ended, RayCaster, Reconnect, WorkerConfig, WorkerError, run_with};
+use terrafarm_worker::{
+    Caster, Ended, RayCaster, Reconnect, ShareTiles, WorkerConfig, WorkerError, run_with,
+};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
@@ -56,6 +58,7 @@ impl Coordinator {
             memory_limit_bytes: 1 << 30,
             rules: Rules::default(),
             bandwidth_bytes_per_s: None,
+            share: ShareTiles::Never,
             reconnect: Reconnect {
                 attempts: Some(3),
                 first: Duration::from_millis(1),
@@ -76,9 +79,17 @@ impl Coordinator {
     }
 
     pub async fn welcome_with(&self, silence: Duration) -> Peer {
+        self.admit(None, silence).await
+    }
+
+    pub async fn welcome_by(&self, token: Option<&FarmToken>) -> Peer {
+        self.admit(token, PATIENCE).await
+    }
+
+    async fn admit(&self, token: Option<&FarmToken>, silence: Duration) -> Peer {
         let accepted = tokio::time::timeout(PATIENCE, self.listener.accept());
         let (stream, _) = accepted.await.expect("a worker connects").unwrap();
-        let greeting = accept(stream, None, "terrafarm test", PATIENCE).await.unwrap();
+        let greeting = accept(stream, token, "terrafarm test", PATIENCE).await.unwrap();
         let (connection, hello) = greeting.welcome(1, "tower", silence / 3, silence).await.unwrap();
         Peer { connection, hello, asked: Vec::new() }
     }
@@ -105,7 +116,7 @@ impl Peer {
     pub async fn serve(&mut self, terrain: &Terrain) -> Option<Message> {
         loop {
             match self.recv().await {
-                Some(Message::WantBlobs(WantBlobs { hashes })) => {
+                Some(Message::WantBlobs(WantBlobs { hashes, .. })) => {
                     self.asked.extend(&hashes);
                     for hash in hashes.into_iter().rev() {
                         match terrain.blobs.get(&hash) {

@@ -7,6 +7,8 @@
 use super::{LinkError, Writer};
 use crate::codec::{Frames, encode};
 use crate::message::{Lane, Message};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::io::{AsyncWrite, AsyncWriteExt};
 use tokio::sync::mpsc;
 
@@ -14,14 +16,46 @@ use tokio::sync::mpsc;
 #[derive(Debug, Clone)]
 pub struct Outbox {
     urgent: mpsc::Sender<Message>,
-    bulk: mpsc::Sender<Message>,
+    bulk: mpsc::Sender<(Message, Load)>,
+    meter: Meter,
 }
 
 /// The other end, for [`Writer::run`].
 #[derive(Debug)]
 pub struct OutboxEnd {
     urgent: mpsc::Receiver<Message>,
-    bulk: mpsc::Receiver<Message>,
+    bulk: mpsc::Receiver<(Message, Load)>,
+}
+
+/// Bytes behind the messages that wait in outboxes, or are being written; clones count
+/// together.
+#[derive(Debug, Clone, Default)]
+pub struct Meter(Arc<AtomicU64>);
+
+impl Meter {
+    /// How many they are now.
+    pub fn bytes(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    fn load(&self, message: &Message) -> Load {
+        let bytes = message.payload().len() as u64;
+        self.0.fetch_add(bytes, Ordering::Relaxed);
+        Load { meter: self.clone(), bytes }
+    }
+}
+
+/// The bytes behind one message; counted until it is dropped.
+#[derive(Debug)]
+struct Load {
+    meter: Meter,
+    bytes: u64,
+}
+
+impl Drop for Load {
+    fn drop(&mut self) {
+        self.meter.0.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
 }
 
 /// Why a message was not queued.
@@ -38,45 +72,63 @@ pub enum Unsent {
 /// # Panics
 /// If a capacity is 0.
 pub fn outbox(urgent: usize, bulk: usize) -> (Outbox, OutboxEnd) {
+    metered(urgent, bulk, Meter::default())
+}
+
+/// The same, with a meter of what waits.
+///
+/// # Panics
+/// If a capacity is 0.
+pub fn metered(urgent: usize, bulk: usize, meter: Meter) -> (Outbox, OutboxEnd) {
     let (urgent_in, urgent_out) = mpsc::channel(urgent);
     let (bulk_in, bulk_out) = mpsc::channel(bulk);
-    (Outbox { urgent: urgent_in, bulk: bulk_in }, OutboxEnd { urgent: urgent_out, bulk: bulk_out })
+    let outbox = Outbox { urgent: urgent_in, bulk: bulk_in, meter };
+    (outbox, OutboxEnd { urgent: urgent_out, bulk: bulk_out })
 }
 
 impl Outbox {
     /// Queues a message on its lane; waits while that lane is full.
     pub async fn send(&self, message: impl Into<Message>) -> Result<(), LinkError> {
         let message = message.into();
-        self.lane(&message).send(message).await.map_err(|_| LinkError::Closed)
+        match message.lane() {
+            Lane::Urgent => self.urgent.send(message).await.map_err(|_| LinkError::Closed),
+            Lane::Bulk => {
+                let load = self.meter.load(&message);
+                self.bulk.send((message, load)).await.map_err(|_| LinkError::Closed)
+            }
+        }
     }
 
     /// Queues a message if there is room on its lane; it is dropped if there is none, or
     /// if the connection is closed.
     pub fn try_send(&self, message: impl Into<Message>) -> Result<(), Unsent> {
         let message = message.into();
-        self.lane(&message).try_send(message).map_err(|refused| match refused {
-            mpsc::error::TrySendError::Full(_) => Unsent::Full,
-            mpsc::error::TrySendError::Closed(_) => Unsent::Closed,
-        })
+        match message.lane() {
+            Lane::Urgent => self.urgent.try_send(message).map_err(unsent),
+            Lane::Bulk => {
+                let load = self.meter.load(&message);
+                self.bulk.try_send((message, load)).map_err(unsent)
+            }
+        }
     }
 
     /// Whether the connection has ended.
     pub fn is_closed(&self) -> bool {
         self.urgent.is_closed()
     }
+}
 
-    fn lane(&self, message: &Message) -> &mpsc::Sender<Message> {
-        match message.lane() {
-            Lane::Urgent => &self.urgent,
-            Lane::Bulk => &self.bulk,
-        }
+fn unsent<T>(refused: mpsc::error::TrySendError<T>) -> Unsent {
+    match refused {
+        mpsc::error::TrySendError::Full(_) => Unsent::Full,
+        mpsc::error::TrySendError::Closed(_) => Unsent::Closed,
     }
 }
 
 /// What the writer does next.
 enum Next {
     Urgent(Message),
-    Bulk(Message),
+    Bulk(Message, Load),
     Part,
     End,
 }
@@ -85,13 +137,15 @@ impl<W: AsyncWrite + Unpin> Writer<W> {
     /// Sends what comes out of the queues until every [`Outbox`] is dropped and all is
     /// sent, then closes the stream.
     pub async fn run(mut self, mut queues: OutboxEnd) -> Result<(), LinkError> {
-        let mut train: Option<Frames> = None;
+        let mut train: Option<(Frames, Load)> = None;
         loop {
             match queues.next(train.is_some()).await {
                 Next::Urgent(message) => self.send(&message).await?,
-                Next::Bulk(message) => train = Some(encode(self.version, &message)?),
+                Next::Bulk(message, load) => {
+                    train = Some((encode(self.version, &message)?, load));
+                }
                 Next::End => return self.close().await,
-                Next::Part => match train.as_mut().and_then(Iterator::next) {
+                Next::Part => match train.as_mut().and_then(|(frames, _)| frames.next()) {
                     Some(frame) => self.write(frame).await?,
                     None => {
                         train = None;
@@ -108,7 +162,7 @@ impl OutboxEnd {
     /// every [`Outbox`] is dropped and all is taken. Cancel safe.
     pub async fn recv(&mut self) -> Option<Message> {
         match self.next(false).await {
-            Next::Urgent(message) | Next::Bulk(message) => Some(message),
+            Next::Urgent(message) | Next::Bulk(message, _) => Some(message),
             Next::Part | Next::End => None,
         }
     }
@@ -120,7 +174,7 @@ impl OutboxEnd {
         tokio::select! {
             biased;
             Some(message) = self.urgent.recv() => Next::Urgent(message),
-            Some(message) = self.bulk.recv() => Next::Bulk(message),
+            Some((message, load)) = self.bulk.recv() => Next::Bulk(message, load),
             else => Next::End,
         }
     }

@@ -42,6 +42,8 @@ pub enum Role {
     Client,
     /// Asks the coordinator's API: see [`super::desk`].
     Desk,
+    /// Another worker: asks for terrain blobs by hash, and for nothing else.
+    Peer,
 }
 
 impl Role {
@@ -51,6 +53,7 @@ impl Role {
             Role::Worker { .. } => "worker",
             Role::Client => "client",
             Role::Desk => "desk",
+            Role::Peer => "peer",
         }
     }
 }

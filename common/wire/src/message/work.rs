@@ -1,7 +1,7 @@
 //! Messages between the coordinator and a worker: jobs and their results.
 
 use super::{Body, Unfit, fit_reason, own_twin};
-use crate::limits::HAND_BACK_MAX;
+use crate::limits::{AHEAD_CAMERAS_MAX, FRAMES_MAX, HAND_BACK_MAX};
 use crate::pixels::Pixels;
 use crate::twin::{
     CameraTwin, QualityTwin, RegionTwin, ShadingTwin, ShareTwin, SummaryTwin, fit_camera,
@@ -131,6 +131,58 @@ impl Body for Grant {
     fn check(&self) -> Result<(), Unfit> {
         fit_camera(&self.camera)?;
         fit_region(&self.region, self.camera.width, self.camera.height)
+    }
+}
+
+/// Where the cameras of a shot will be: a worker may fetch their terrain before it is
+/// granted a job of theirs. It replaces what was said before of the same shot, and promises
+/// nothing.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ahead {
+    /// The shot, opened before.
+    pub shot: ShotId,
+    /// Frame of the first camera.
+    pub first: FrameIndex,
+    /// Frames from one camera to the next, at least 1.
+    pub stride: u32,
+    /// At least one, at most [`AHEAD_CAMERAS_MAX`].
+    pub cameras: Vec<Camera>,
+}
+
+/// Twin of [`Ahead`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct AheadTwin {
+    shot: ShotId,
+    first: FrameIndex,
+    stride: u32,
+    cameras: Vec<CameraTwin>,
+}
+
+impl Body for Ahead {
+    type Wire = AheadTwin;
+
+    fn to_wire(&self) -> AheadTwin {
+        AheadTwin {
+            shot: self.shot,
+            first: self.first,
+            stride: self.stride,
+            cameras: self.cameras.iter().map(CameraTwin::from).collect(),
+        }
+    }
+
+    fn from_wire(wire: AheadTwin) -> Result<Self, Unfit> {
+        let cameras: Result<Vec<_>, _> = wire.cameras.into_iter().map(Camera::try_from).collect();
+        Ok(Ahead { shot: wire.shot, first: wire.first, stride: wire.stride, cameras: cameras? })
+    }
+
+    fn check(&self) -> Result<(), Unfit> {
+        let fits = (1..=AHEAD_CAMERAS_MAX).contains(&self.cameras.len());
+        Unfit::unless(fits, "the number of cameras ahead is out of range")?;
+        let last = u64::from(self.first)
+            + u64::from(self.stride).saturating_mul(self.cameras.len() as u64 - 1);
+        let fits = self.stride > 0 && last < u64::from(FRAMES_MAX);
+        Unfit::unless(fits, "the frames ahead are out of range")?;
+        self.cameras.iter().try_for_each(fit_camera)
     }
 }
 

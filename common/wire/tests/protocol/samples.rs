@@ -104,7 +104,7 @@ pub fn all() -> Vec<(String, Message)> {
         Ping { number: 1 }.into(),
         Pong { number: u64::MAX }.into(),
         Goodbye { reason: text() }.into(),
-        WantBlobs { hashes: vec![hash, BlobHash([255; 32])] }.into(),
+        WantBlobs { hashes: vec![hash, BlobHash([255; 32])], elsewhere: true }.into(),
         Blob { hash, bytes: b"a tile"[..].into() }.into(),
         NoBlob { hash, why: text() }.into(),
         OpenShot {
@@ -207,6 +207,14 @@ pub fn all() -> Vec<(String, Message)> {
         }
         .into(),
         Speed { pixels_per_s: 31_415_926 }.into(),
+        Elsewhere {
+            hash,
+            workers: vec!["10.0.0.7:4711".parse().unwrap(), "[fe80::7]:4712".parse().unwrap()],
+        }
+        .into(),
+        Sharing { port: 4711 }.into(),
+        Ahead { shot, first: frame, stride: 8, cameras: vec![camera(); 2] }.into(),
+        hello(Role::Peer).into(),
     ];
     let mut seen = 0;
     let named = messages.into_iter().map(|message| {
@@ -330,8 +338,14 @@ pub fn any_message() -> impl Strategy<Value = Message> {
             .into()
         },
     );
-    let want =
-        prop::collection::vec(any_hash(), 1..50).prop_map(|hashes| WantBlobs { hashes }.into());
+    let want = (prop::collection::vec(any_hash(), 1..50), any::<bool>())
+        .prop_map(|(hashes, elsewhere)| WantBlobs { hashes, elsewhere }.into());
+    let ahead = (0u32..1000, 1u32..1000, prop::collection::vec(any_camera(), 1..=64)).prop_map(
+        |(first, stride, cameras)| Ahead { shot: ShotId(7), first, stride, cameras }.into(),
+    );
+    let address = (any::<std::net::IpAddr>(), 1u16..).prop_map(std::net::SocketAddr::from);
+    let elsewhere = (any_hash(), prop::collection::vec(address, 1..=4))
+        .prop_map(|(hash, workers)| Elsewhere { hash, workers }.into());
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
     let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
@@ -345,5 +359,7 @@ pub fn any_message() -> impl Strategy<Value = Message> {
     let hand_back = prop::collection::vec(any::<u64>().prop_map(LeaseId), 0..50)
         .prop_map(|leases| HandBack { leases }.into());
     let sample = prop::sample::select(all()).prop_map(|(_, message)| message);
-    prop_oneof![open, grant, cameras, submit, want, blob, done, failed, hand_back, sample]
+    prop_oneof![
+        open, grant, cameras, submit, want, blob, done, failed, hand_back, ahead, elsewhere, sample
+    ]
 }

@@ -130,7 +130,7 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
                     continue;
                 }
                 wanted.push(open.index);
-                line.work(worker, WantBlobs { hashes: vec![open.index] }).await;
+                line.work(worker, WantBlobs { hashes: vec![open.index], elsewhere: true }).await;
             }
             Message::Blob(blob) => {
                 wanted.retain(|hash| *hash != blob.hash);
@@ -140,7 +140,7 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
                     let hashes: Vec<_> =
                         tiles.filter(|tile| !tile.is_empty()).map(|tile| tile.hash).collect();
                     wanted.extend(&hashes);
-                    line.work(worker, WantBlobs { hashes }).await;
+                    line.work(worker, WantBlobs { hashes, elsewhere: true }).await;
                 }
             }
             // A patient worker: it asks when it is to render again.
@@ -148,7 +148,7 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
             Message::Revoke(revoke) => waiting.retain(|grant| grant.lease != revoke.lease),
             Message::Grant(grant) => {
                 if !wanted.is_empty() {
-                    line.work(worker, WantBlobs { hashes: wanted.clone() }).await;
+                    line.work(worker, WantBlobs { hashes: wanted.clone(), elsewhere: true }).await;
                 }
                 waiting.push(grant);
             }

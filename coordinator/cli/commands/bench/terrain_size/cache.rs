@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
-use terrafarm_common::id::{BlobHash, LeaseId};
+use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_common::region::Region;
 use terrafarm_raycast::meter::measure;
 use terrafarm_raycast::{Depths, Missing, Pyramid, Unseen, View, depths};
@@ -46,7 +46,7 @@ impl<'s> Cache<'s> {
 
     /// A new frame begins: tiles of the one before may go.
     pub fn begin(&mut self) {
-        self.terrain.begin_job();
+        self.terrain.begin_job(ShotId(0), 0);
     }
 
     fn scene(&self) -> anyhow::Result<Scene<Pyramid>> {
