@@ -24,14 +24,12 @@ fn a_view_says_who_renders_what_and_how_far_it_is() {
     assert_eq!((shot.state, shot.frames, shot.frames_done), (ShotState::Running, 10, 0));
     assert_eq!((shot.eta_s, shot.last_frame, shot.submitted_s), (None, None, WALL_S));
     // What it holds is done; frames wait to be taken, so no more are begun.
-    let mut left = bench.farm.granted.keys().copied().collect::<Vec<_>>();
-    while let Some(lease) = left.pop() {
+    while let Some(lease) = bench.farm.granted.keys().next().copied() {
         let Granted { worker: by, region, .. } = bench.farm.granted[&lease];
         let pixels = Pixels::raw(vec![7; region.area() as usize * 3].into()).unwrap();
         let timesheet = Timesheet { render_us: 900, ..Timesheet::default() };
         let report = RenderReport { cost_us: 900, ..RenderReport::default() };
         bench.say(Peer::Worker(by), Done { lease, pixels, report, timesheet, check: None });
-        left = bench.farm.granted.keys().copied().collect();
     }
     let done = look(&mut bench);
     let (one, shot) = (&done.workers[0], &done.shots[0]);
