@@ -31,6 +31,15 @@ fn commands_in(document: &str) -> Vec<String> {
     found
 }
 
+/// The words of a command as a shell takes them, double quotes being the only ones in use.
+fn words(command: &str) -> Vec<String> {
+    let parts = command.split('"').enumerate().flat_map(|(number, part)| match number % 2 {
+        0 => part.split_whitespace().map(str::to_owned).collect(),
+        _ => vec![part.to_owned()],
+    });
+    parts.collect()
+}
+
 #[test]
 fn every_terrafarm_command_in_the_documents_is_understood() {
     for document in ["README.md", "CONTRIBUTING.md"] {
@@ -42,7 +51,7 @@ fn every_terrafarm_command_in_the_documents_is_understood() {
                 continue;
             };
             // Unknown commands and flags are refused before help is shown.
-            let words: Vec<_> = arguments.split_whitespace().collect();
+            let words = words(arguments);
             let mut help = crate::support::terrafarm();
             let result = help.args(&words).arg("--help").output().unwrap();
             let said = String::from_utf8_lossy(&result.stderr);
