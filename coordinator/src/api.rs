@@ -1,6 +1,6 @@
 //! The coordinator's JSON API and its page: one router, two carriers.
 //!
-//! `docs/API.md` documents every route. [`serve`](serve::serve) carries it by HTTP, for the
+//! `docs/API.md` documents every route. `serve.rs` carries it by HTTP, for the
 //! page, scripts and Prometheus; `carry` over the encrypted link, for the command line.
 //! Everything here reads views and passes orders on: it decides nothing about the farm.
 //!

@@ -5,7 +5,7 @@
 //! present job has asked for stay until it ends: so a job always gets further. A tile that
 //! was wrongly forgotten comes back from the cache on disk in about a millisecond.
 //!
-//! Tiles that were fetched before their turn lie in the [`Pantry`], within an eighth of the
+//! Tiles that were fetched before their turn lie in the pantry, within an eighth of the
 //! limit, until the job that is due begins. Room for them is made by tiles that no job has
 //! looked at for long, never by what jobs use; where there is none they stay packed on disk.
 //!
