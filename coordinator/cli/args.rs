@@ -596,7 +596,7 @@ pub struct BenchTerrainSize {
 pub struct BenchScaleOut {
     /// Numbers of workers, with commas [default: 1,2,4,8; with --fake 1,10,100,1000]
     #[arg(long, value_delimiter = ',', value_name = "N",
-        value_parser = clap::value_parser!(u32).range(1..=4096))]
+        value_parser = clap::value_parser!(u32).range(1..=16_384))]
     pub workers: Vec<u32>,
     /// Workers that sleep instead of rendering: how much the coordinator can do
     #[arg(long)]

@@ -71,7 +71,7 @@ impl Default for Config {
             name: "terrafarm".into(),
             blob_memory_bytes: 512 << 20,
             redirect_above_bytes: 8 << 20,
-            connections_max: 4608,
+            connections_max: 16_896,
             trust: Trust::Loopback,
             strangers_max: 256,
             greeting_limit: Duration::from_secs(5),

@@ -1,7 +1,7 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
 use crate::secret::{self, Source};
-use crate::{Outcome, args, lan, notify};
+use crate::{Outcome, args, files, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -16,6 +16,8 @@ use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig};
 use tokio::net::{TcpListener, TcpStream};
 
 const MIB: u64 = 1 << 20;
+/// Open files that are enough for a thousand workers, and the queue.
+const FILES_ENOUGH: u64 = 1200;
 /// How long the network is listened to before this PC is looked at again.
 const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
@@ -26,6 +28,7 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
     let web = args.web.http.unwrap_or(HTTP);
     let reachable = !is_this_pc(address.ip()) || !(args.web.no_http || is_this_pc(web.ip()));
+    warn_of_few_files(files::raise_open_files());
     let (trust, source) = secret::to_serve(&args.security, reachable)?;
     runtime()?.block_on(async {
         let listener = TcpListener::bind(address).await.with_context(|| {
@@ -51,6 +54,16 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
         Ok(Outcome::Done)
     })
+}
+
+/// A worker takes a file handle; a farm of many should not learn that in the night.
+fn warn_of_few_files(files: Option<u64>) {
+    if let Some(files) = files.filter(|&files| files < FILES_ENOUGH) {
+        eprintln!(
+            "terrafarm: warning: this system lets the coordinator open {files} files, which is less \
+             than as many workers; \"ulimit -n\" or LimitNOFILE= raises that"
+        );
+    }
 }
 
 /// Lets workers on the local network find this coordinator.
