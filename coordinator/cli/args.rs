@@ -307,8 +307,9 @@ pub struct Render {
     /// Shape of the jobs: columns, tiles, or tiles:SIDE
     #[arg(long, value_parser = parse_split, default_value = "columns")]
     pub split: Split,
-    /// Farm to render on [default: local workers]
-    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
+    /// Farm to render on [default: that of TERRAFARM_COORDINATOR, unless --workers or
+    /// --threads is given; else local workers]
+    #[arg(long, value_name = "HOST:PORT")]
     pub coordinator: Option<String>,
     /// How the link to the farm is secured
     #[command(flatten)]
