@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod full;
-mod house;
+pub(crate) mod house;
 mod killed;
 mod rules;
 
