@@ -32,7 +32,7 @@ use terrafarm_wire::Message;
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// News of its own work that may wait for the task.
 const NEWS: usize = 1024;
@@ -101,8 +101,8 @@ pub(super) struct Task {
     unwritten: Vec<Picture>,
     /// Why nothing goes on: the disk is full or fails.
     stalled: Option<QueueError>,
-    /// The shot whose film is being made.
-    finishing: Option<(ShotId, CancellationToken)>,
+    /// The shot whose film is being made, and what stops that when it is dropped.
+    finishing: Option<(ShotId, Option<DropGuard>)>,
     /// How often pictures of a shot were found damaged.
     losses: BTreeMap<ShotId, u32>,
     swept: Option<Instant>,
