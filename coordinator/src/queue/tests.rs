@@ -105,6 +105,22 @@ async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_a_power_cut_emptied_is_asked_for_before_the_shot_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let house = house.restart().await;
+    let (torn, _) = land.blobs[1];
+    let name = torn.to_hex();
+    fs::write(folder.path().join("blobs").join(&name[..2]).join(name), b"").unwrap();
+    let refused = house.queue.submit(plan(&land, 1)).await.unwrap_err();
+    assert!(matches!(&refused, QueueError::Missing(blobs) if *blobs == [torn]), "{refused}");
+    land.send(&house.queue).await;
+    house.queue.submit(plan(&land, 1)).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn damaged_pictures_are_rendered_again_before_the_film_is_made() {
     let folder = tempfile::tempdir().unwrap();
     let land = Land::new(folder.path());
