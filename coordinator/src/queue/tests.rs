@@ -182,11 +182,13 @@ async fn a_second_coordinator_is_told_who_holds_the_folder() {
 async fn terrain_that_nobody_needs_goes_beyond_its_limit() {
     let folder = tempfile::tempdir().unwrap();
     let land = Land::new(folder.path());
-    let mut config = house::config(folder.path());
-    (config.terrain_cache_bytes, config.terrain_grace) = (0, Duration::ZERO);
-    let house = House::with(config).await;
+    let house = House::open(folder.path()).await;
     land.send(&house.queue).await;
     house.queue.submit(plan(&land, 2)).await.unwrap();
+    // Without grace from here on: before, the first sweep would take what is being sent.
+    let mut config = house.cut_off();
+    (config.terrain_cache_bytes, config.terrain_grace) = (0, Duration::ZERO);
+    let house = House::with(config).await;
     let _worker = house.hire(WorkerId(1)).await;
     until(&house.queue, |list| list[0].state == ShotState::Done).await;
     let all: Vec<_> = land.blobs.iter().map(|(hash, _)| *hash).collect();
