@@ -62,6 +62,8 @@ enum News {
     Hung(StayId),
     /// The farm asks for terrain that is not here.
     Lacks(StayId, BlobHash),
+    /// The disk does not read terrain that the farm asks for.
+    Unread(StayId, BlobHash),
     /// A picture was written, or not.
     Stored(Picture, Result<u64, QueueError>),
     /// A shot was finished, or not.
@@ -215,7 +217,12 @@ impl Task {
                     self.leave(shot).await;
                 }
             }
-            News::Lacks(stay, hash) => self.lacks(stay, hash).await,
+            News::Lacks(stay, hash) => {
+                // It may have come since.
+                let is_here = self.shared.blobs.missing(vec![hash]).is_empty();
+                self.lacks(stay, hash, !is_here).await;
+            }
+            News::Unread(stay, hash) => self.lacks(stay, hash, true).await,
             News::Stored(picture, stored) => self.stored(picture, stored).await,
             News::Finished(shot, result) => self.finished(shot, result).await,
             News::Swept(result) => {

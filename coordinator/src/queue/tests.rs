@@ -104,6 +104,26 @@ async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
     assert_eq!(house.queue.shot(shot).unwrap().frames_failed, 0);
 }
 
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_the_disk_does_not_read_is_waited_for_and_fails_no_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let name = land.blobs[1].0.to_hex();
+    house.queue.submit(plan(&land, 3)).await.unwrap();
+    let (blob, aside) = (folder.path().join("blobs").join(&name[..2]).join(&name), "aside");
+    fs::rename(&blob, folder.path().join(aside)).unwrap();
+    // A file that can be opened, and of which the first byte cannot be read.
+    std::os::unix::fs::symlink("/proc/self/mem", &blob).unwrap();
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Stalled).await;
+    fs::rename(folder.path().join(aside), &blob).unwrap();
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    assert_eq!(house.queue.shots()[0].frames_failed, 0);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn terrain_that_a_power_cut_emptied_is_asked_for_before_the_shot_is_taken() {
     let folder = tempfile::tempdir().unwrap();

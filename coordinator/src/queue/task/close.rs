@@ -188,6 +188,13 @@ impl Task {
         for shot in refused.map(|(id, _)| id).collect::<Vec<_>>() {
             self.book.set_refused(shot, None);
         }
+        for (shot, hash) in self.book.all_lacking() {
+            if self.shared.blobs.missing(vec![hash]).is_empty() {
+                self.book.set_lacks(shot, None);
+                self.sync_pause(shot).await;
+                self.changed.insert(shot);
+            }
+        }
         if self.stalled.is_none() {
             return;
         }
