@@ -54,6 +54,8 @@ const ORDER_BYTES_MAX: usize = 4 << 10;
 const HASHES_BYTES_MAX: usize = 8 << 20;
 /// Long bodies (blobs and shots) that are taken at once: what they may take of memory.
 const BULKY_AT_ONCE: usize = 4;
+/// Pictures that are read from the disk and made small at once: the largest takes 0.8 GB.
+const PREVIEWS_AT_ONCE: usize = 2;
 /// How long an order may take, its body included.
 const ORDER_LIMIT: Duration = Duration::from_secs(30);
 /// How long a long body may take to come.
@@ -68,6 +70,7 @@ pub struct Desk {
     stop: CancellationToken,
     board: Mutex<Option<Arc<Board>>>,
     bulky: Semaphore,
+    previews: Arc<Semaphore>,
     streams: Arc<Semaphore>,
 }
 
@@ -89,6 +92,7 @@ impl Desk {
             stop,
             board: Mutex::default(),
             bulky: Semaphore::new(BULKY_AT_ONCE),
+            previews: Arc::new(Semaphore::new(PREVIEWS_AT_ONCE)),
             streams: Arc::new(Semaphore::new(live::STREAMS_MAX)),
         })
     }

@@ -18,6 +18,8 @@ use tokio::net::{TcpListener, TcpStream};
 const MIB: u64 = 1 << 20;
 /// Open files that are enough for a thousand workers, and the queue.
 const FILES_ENOUGH: u64 = 1200;
+/// How long threads that wait for a disk may take when the coordinator stops.
+const FAREWELL: Duration = Duration::from_secs(2);
 /// How long the network is listened to before this PC is looked at again.
 const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
@@ -30,7 +32,8 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let reachable = !is_this_pc(address.ip()) || !(args.web.no_http || is_this_pc(web.ip()));
     warn_of_few_files(files::raise_open_files());
     let (trust, source) = secret::to_serve(&args.security, reachable)?;
-    runtime()?.block_on(async {
+    let runtime = runtime()?;
+    let served = runtime.block_on(async {
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; is another coordinator running there?")
         })?;
@@ -53,7 +56,10 @@ pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
         notify::ready(&format!("listening on {address}"));
         terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
         Ok(Outcome::Done)
-    })
+    });
+    // What a slow disk holds up is cut off there, as it may be anywhere.
+    runtime.shutdown_timeout(FAREWELL);
+    served
 }
 
 /// A worker takes a file handle; a farm of many should not learn that in the night.

@@ -199,6 +199,12 @@ impl Book {
         }
     }
 
+    /// The shots that lack a blob, and which.
+    pub fn all_lacking(&self) -> Vec<(ShotId, BlobHash)> {
+        let lacks = |&id: &ShotId| Some((id, self.shots.get(&id)?.lacks?));
+        self.lacking.iter().filter_map(lacks).collect()
+    }
+
     /// The shots that lack this blob.
     pub fn lacking(&self, hash: BlobHash) -> Vec<ShotId> {
         let lacks = |id: &ShotId| self.shots.get(id).is_some_and(|shot| shot.lacks == Some(hash));
