@@ -155,7 +155,7 @@ pub struct Priority {
 pub struct Clear {
     /// Name or number of the worker
     pub worker: String,
-    /// Number of the shot [default: every one that it is blocked for]
+    /// Number of the shot [default: every one, and whether it is trusted at all]
     #[arg(long)]
     pub shot: Option<u64>,
     /// The coordinator to ask

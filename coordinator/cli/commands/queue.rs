@@ -245,18 +245,11 @@ pub fn clear(args: &args::Clear) -> anyhow::Result<Outcome> {
     runtime()?.block_on(async {
         let mut desk = Desk::open(&args.office).await?;
         let worker = desk.worker(&args.worker).await?;
-        let shots = match args.shot {
-            Some(shot) => vec![shot],
-            None => worker.blocked.iter().map(|shot| shot.0).collect(),
+        let path = match args.shot {
+            Some(shot) => format!("/api/v1/shots/{shot}/workers/{}/unblock", worker.id.0),
+            None => format!("/api/v1/workers/{}/clear", worker.id.0),
         };
-        if shots.is_empty() {
-            return say(&format!("{} is blocked for no shot", worker.id));
-        }
-        for shot in shots {
-            let path = format!("/api/v1/shots/{shot}/workers/{}/unblock", worker.id.0);
-            desk.order(Verb::Post, &path, serde_json::Value::Null).await?;
-        }
-        Ok(Outcome::Done)
+        desk.order(Verb::Post, &path, serde_json::Value::Null).await
     })
 }
 

@@ -28,6 +28,11 @@ pub(super) async fn drain(State(desk): State<Arc<Desk>>, Path(worker): Path<Stri
     Ok(Json(json!({"done": desk.order(Order::Drain(worker_id(&worker)?)).await?})))
 }
 
+/// `POST /api/v1/workers/{worker}/clear`
+pub(super) async fn clear(State(desk): State<Arc<Desk>>, Path(worker): Path<String>) -> Answer {
+    Ok(Json(json!({"done": desk.order(Order::Clear(worker_id(&worker)?, None)).await?})))
+}
+
 /// `GET /api/v1/farm`
 pub(super) async fn farm(State(desk): State<Arc<Desk>>) -> Answer {
     let board = desk.board();

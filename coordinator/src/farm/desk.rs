@@ -61,12 +61,15 @@ impl Farm {
                 Ok(format!("{shot} is canceled"))
             }
             Order::Clear(worker, shot) => {
-                self.known(shot)?;
+                shot.map_or(Ok(()), |shot| self.known(shot))?;
                 if !self.workers.contains_key(&worker) {
                     return Err(OrderError::NoWorker(worker));
                 }
-                self.schedule(now, Event::WorkerCleared { worker, shot: Some(shot) });
-                Ok(format!("{worker} gets jobs of {shot} again"))
+                self.schedule(now, Event::WorkerCleared { worker, shot });
+                Ok(match shot {
+                    Some(shot) => format!("{worker} gets jobs of {shot} again"),
+                    None => format!("{worker} is trusted and gets jobs of every shot again"),
+                })
             }
             Order::Drain(worker) => {
                 if !self.workers.contains_key(&worker) {

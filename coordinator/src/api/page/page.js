@@ -180,11 +180,9 @@ function newWorker(worker) {
   const part = { name: cell("name"), state: cell("state"), speed: cell("speed"), work: cell("work"), jobs: cell("jobs"), shares: cell("shares"), drain: make("button", { textContent: "drain", title: "finish what it renders and leave" }) };
   twice(part.drain, "drain", "really?", () => ask("POST", `workers/${worker.id}/drain`));
   const action = make("span", { className: "action", role: "cell" }, part.drain);
-  part.unblock = make("button", { textContent: "unblock", hidden: true });
-  part.unblock.addEventListener("click", () => {
-    for (const shot of part.worker.blocked) ask("POST", `shots/${shot}/workers/${worker.id}/unblock`);
-  });
-  action.append(part.unblock);
+  part.clear = make("button", { textContent: "clear", title: "trust it, and give it jobs of every shot", hidden: true });
+  part.clear.addEventListener("click", () => ask("POST", `workers/${worker.id}/clear`));
+  action.append(part.clear);
   part.element = make("div", { className: "worker", role: "row" }, part.name, part.state, part.speed, part.work, part.jobs, part.shares, action);
   return part;
 }
@@ -206,7 +204,8 @@ function showWorker(part, worker) {
   set(part.shares, "textContent", `${percent(worker.rendering)} / ${percent(worker.terrain)}`);
   set(part.drain, "disabled", worker.state === "draining");
   part.drain.setAttribute("aria-label", `drain ${worker.name}`);
-  set(part.unblock, "hidden", worker.blocked.length === 0);
+  part.clear.setAttribute("aria-label", `clear ${worker.name}`);
+  set(part.clear, "hidden", worker.blocked.length === 0 && !worker.distrusted);
 }
 
 const kinds = {

@@ -66,6 +66,20 @@ fn orders_change_what_is_seen_and_unknown_ones_say_what_there_is_not() {
 }
 
 #[test]
+fn a_distrusted_worker_is_cleared_when_no_shot_is_under_way() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 2);
+    bench.farm.schedule(bench.now, Event::WorkerDistrusted { worker: WorkerId(1) });
+    assert!(look(&mut bench).workers[0].distrusted);
+    let said = bench.farm.order(bench.now, Order::Clear(WorkerId(1), Some(ShotId(7))));
+    assert_eq!(said, Err(OrderError::NoShot(ShotId(7))));
+    bench.farm.order(bench.now, Order::Clear(WorkerId(1), None)).unwrap();
+    assert!(!look(&mut bench).workers[0].distrusted);
+    let nobody = bench.farm.order(bench.now, Order::Clear(WorkerId(2), None));
+    assert_eq!(nobody, Err(OrderError::NoWorker(WorkerId(2))));
+}
+
+#[test]
 fn a_view_of_1000_workers_and_256_shots_takes_the_driver_milliseconds() {
     let mut bench = Bench::new();
     let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
