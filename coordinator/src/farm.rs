@@ -253,6 +253,7 @@ impl Farm {
                 let pixels_per_s = speed.pixels_per_s;
                 self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
             }
+            Message::Status(status) => self.tally.told(worker, status),
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
             Message::Sharing(sharing) => self.shares(worker, sharing.port),
             Message::Goodbye(goodbye) => {
@@ -475,7 +476,7 @@ impl Farm {
                 }
                 Action::FrameComplete { shot, frame } => self.finish_frame(now, shot, frame),
                 Action::FrameFailed { shot, frame, reason } => {
-                    tracing::warn!(%shot, frame, "frame failed: {reason}");
+                    tracing::warn!(%shot, frame = self.number(shot, frame), "frame failed: {reason}");
                     if let Some(state) = self.shots.frame_failed(shot, frame) {
                         let peer = Peer::Client(state.client);
                         let reason = clip_reason(&reason.to_string());

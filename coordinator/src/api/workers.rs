@@ -65,6 +65,7 @@ impl Desk {
                 "busy": workers.busy,
                 "draining": workers.draining,
                 "threads": workers.threads,
+                "threads_allowed": workers.threads_allowed,
             },
             "shots": shots,
             "jobs_running": farm.jobs_running,
@@ -72,6 +73,8 @@ impl Desk {
             "jobs_repeated": farm.jobs_repeated,
             "results_refused": farm.results_refused,
             "frames_done": farm.frames_done,
+            "blobs_damaged": farm.blobs_damaged,
+            "given_bytes": farm.given_bytes,
             "now": now,
         })
     }
@@ -88,6 +91,8 @@ pub(super) struct WorkerCounts {
     pub draining: usize,
     /// Render threads of all.
     pub threads: u64,
+    /// Those that may render now.
+    pub threads_allowed: u64,
 }
 
 impl WorkerCounts {
@@ -101,6 +106,7 @@ impl WorkerCounts {
                 WorkerState::Draining => counts.draining += 1,
             }
             counts.threads += u64::from(worker.threads);
+            counts.threads_allowed += u64::from(worker.threads_allowed);
         }
         counts
     }
