@@ -119,6 +119,22 @@ fn a_second_coordinator_with_the_same_folder_is_told_who_has_it() {
 }
 
 #[test]
+fn a_coordinator_without_a_folder_says_what_to_do_and_one_with_the_variable_has_one() {
+    let world = World::new(64);
+    let (_running, address) = crate::support::coordinator();
+    let mut command = terrafarm();
+    command.arg("submit").arg(&world.scene).arg("--flight").arg(&world.flight).args(SIZE);
+    let (_, said) = run(command.args(["--coordinator", &address]), 2);
+    assert!(said.contains("start it with --data FOLDER"), "{said}");
+    let data = world.dir.path("from-variable");
+    let mut command = terrafarm();
+    command.args(["coordinator", "--no-http", "--listen", "127.0.0.1:0"]);
+    let mut named = Running::start(command.env("TERRAFARM_DATA", &data));
+    named.expect("coordinator on ");
+    assert!(data.join("queue.redb").is_file());
+}
+
+#[test]
 fn a_damaged_queue_is_said_to_be_damaged() {
     let dir = Dir::new();
     let data = dir.path("data");

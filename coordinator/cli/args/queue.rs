@@ -9,7 +9,7 @@ use terrafarm_common::region::Split;
 /// The page and the API of `terrafarm coordinator`.
 #[derive(Debug, ClapArgs)]
 pub struct Web {
-    /// Address of the page, the API and the metrics by HTTP [default: 127.0.0.1:7879];
+    /// Address of the page, the API and the metrics by HTTP [default: 127.0.0.1:7071];
     /// where other PCs can reach it, a key is needed
     #[arg(long, value_name = "ADDRESS", conflicts_with = "no_http")]
     pub http: Option<SocketAddr>,

@@ -19,7 +19,7 @@ const MIB: u64 = 1 << 20;
 /// How long the network is listened to before this PC is looked at again.
 const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
-const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7879);
+const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7071);
 
 /// Serves a farm until Ctrl-C or SIGTERM.
 pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
