@@ -363,8 +363,12 @@ pub struct Coordinator {
     #[arg(long, value_name = "MIB", default_value_t = 8, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
     pub share_above: u64,
     /// Folder for a queue of shots that outlives whoever submits them, and the coordinator
-    #[arg(long, value_name = "FOLDER")]
+    #[arg(long, value_name = "FOLDER", env = "TERRAFARM_DATA")]
     pub data: Option<PathBuf>,
+    /// File for a record of all that the scheduler is told, 1 GiB at most, to be played again
+    /// with "terrafarm simulate --replay"; if there is such a file, a number is added
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
     /// The page and the API by HTTP
     #[command(flatten)]
     pub web: queue::Web,

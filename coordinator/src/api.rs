@@ -122,6 +122,7 @@ pub(crate) fn router(desk: Arc<Desk>) -> Router {
         .route("/api/v1/farm", get(workers::farm))
         .route("/api/v1/workers", get(workers::list))
         .route("/api/v1/workers/{worker}/drain", post(workers::drain))
+        .route("/api/v1/workers/{worker}/clear", post(workers::clear))
         .route("/api/v1/shots", get(shots::list))
         .route("/api/v1/shots/{shot}", get(shots::one))
         .route("/api/v1/shots/{shot}/pause", post(shots::pause))

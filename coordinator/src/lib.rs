@@ -12,6 +12,7 @@ mod blobs;
 pub mod client;
 mod driver;
 mod farm;
+mod journal;
 pub mod order;
 mod peer;
 pub mod queue;
@@ -21,4 +22,5 @@ mod strangers;
 mod thumbnails;
 pub mod view;
 
-pub use driver::{Config, CoordinatorError, run, run_with_page};
+pub use driver::{Config, Coordinator, CoordinatorError, run};
+pub use journal::JournalError;

@@ -97,6 +97,11 @@ impl<P> Terrain<P> {
         self.bytes + self.pantry.bytes()
     }
 
+    /// The most they may take.
+    pub fn limit_bytes(&self) -> u64 {
+        self.limit_bytes
+    }
+
     /// Whether the index of this store is in memory. Marks it as used.
     pub fn has_store(&mut self, store: BlobHash) -> bool {
         self.idle.retain(|idle| *idle != store);

@@ -270,12 +270,12 @@ mod tests {
     fn only_addresses_and_names_of_this_pc_are_hosts() {
         let access = Access { key: None, names: vec!["PC-One".into()] };
         for host in
-            ["127.0.0.1:7879", "localhost", "[::1]:7879", "pc-one:80", "10.0.0.3", "localhost."]
+            ["127.0.0.1:7071", "localhost", "[::1]:7071", "pc-one:80", "10.0.0.3", "localhost."]
         {
             assert!(access.is_ours(host), "{host}");
         }
         for host in
-            ["", "evil.example", "localhost.evil.example:7879", "pc-one.evil.example", "[x]"]
+            ["", "evil.example", "localhost.evil.example:7071", "pc-one.evil.example", "[x]"]
         {
             assert!(!access.is_ours(host), "{host}");
         }
@@ -285,12 +285,12 @@ mod tests {
     fn pages_of_other_sites_are_refused() {
         let access = Access { key: None, names: Vec::new() };
         let check = |method: Method, more: &[(&'static str, &str)]| {
-            let mut pairs = vec![("host", "127.0.0.1:7879")];
+            let mut pairs = vec![("host", "127.0.0.1:7071")];
             pairs.extend_from_slice(more);
             access.check_source(&method, &headers(&pairs)).is_ok()
         };
         assert!(check(Method::POST, &[]), "scripts send no origin");
-        assert!(check(Method::POST, &[("origin", "http://127.0.0.1:7879")]));
+        assert!(check(Method::POST, &[("origin", "http://127.0.0.1:7071")]));
         assert!(!check(Method::POST, &[("origin", "http://127.0.0.1:8080")]));
         assert!(!check(Method::POST, &[("origin", "null")]));
         assert!(!check(Method::GET, &[("origin", "https://evil.example")]));

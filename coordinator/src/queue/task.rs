@@ -355,7 +355,7 @@ impl Task {
             },
             (ShotState::Paused, _) => "its shot is paused".into(),
             (ShotState::Stalled, _) => format!("its shot cannot go on: {}", view.note),
-            (state, _) => format!("its shot is {}", super::state_name(state)),
+            (state, _) => format!("its shot is {}", state.name()),
         })
     }
 

@@ -137,12 +137,14 @@ impl Task {
         }
         let name = format!("queue, {shot}");
         let Ok(end) = self.farm.join(id.client(), &name).await else { return };
+        let first = state.record.plan.first_frame;
+        let in_flight = numbers.iter().map(|index| first + index).collect();
         if let Some(stay) = self.stays.get_mut(&id) {
             stay.frames = numbers;
         }
         let (farm, blobs, tell) = (self.farm.clone(), self.shared.blobs.clone(), self.tell.clone());
         self.errands.spawn(attend(id, end, farm, blobs, tell));
-        let adoption = Box::new(Adoption { shot, submit, cameras });
+        let adoption = Box::new(Adoption { shot, submit, cameras, numbers: in_flight });
         let _ = self.farm.tell(id.client(), PeerEvent::Adopt(adoption)).await;
         self.sync_pause(shot).await;
     }
