@@ -67,6 +67,11 @@ mod documents;
 #[path = "whole/oracles.rs"]
 mod oracles;
 
+/// Several PCs within one: links that are cut, workers that help each other.
+#[cfg(target_os = "linux")]
+#[path = "whole/namespaces.rs"]
+mod namespaces;
+
 /// What `deploy/` starts: units, the ssh launcher, manifests.
 #[cfg(unix)]
 #[path = "whole/deploy.rs"]

@@ -187,6 +187,12 @@ impl Running {
         (code, std::mem::take(&mut self.seen))
     }
 
+    /// The number of the process.
+    #[cfg(target_os = "linux")]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// kill -9.
     pub fn kill(&mut self) {
         self.child.kill().unwrap();
@@ -220,6 +226,19 @@ pub fn coordinator_on(listen: &str) -> (Running, String) {
     let line = running.expect("coordinator on ");
     let address = line.rsplit(' ').next().unwrap().to_owned();
     (running, address)
+}
+
+/// A coordinator with a token, which is made in this folder; its address and its token.
+#[cfg(unix)]
+pub fn coordinator_with_token(dir: &Dir) -> (Running, String, String) {
+    let file = dir.path("farm.token");
+    let mut command = terrafarm();
+    command.args(["-v", "coordinator", "--listen", "127.0.0.1:0", "--no-http", "--token-file"]);
+    let mut running = Running::start(command.arg(&file));
+    let line = running.expect("coordinator on ");
+    let address = line.rsplit(' ').next().unwrap().to_owned();
+    let token = fs::read_to_string(file).unwrap().trim().to_owned();
+    (running, address, token)
 }
 
 /// A worker of its own process, one thread, no disk cache.
