@@ -480,6 +480,12 @@ impl Ledger {
     }
 }
 
+impl Drop for Ledger {
+    fn drop(&mut self) {
+        self.close();
+    }
+}
+
 fn pack(cameras: &[Camera]) -> Vec<u8> {
     let numbers = |camera: &Camera| {
         let axes = [camera.position, camera.right, camera.up, camera.forward];
