@@ -9,9 +9,9 @@ use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
-const SIZE: [&str; 4] = ["--size", "192x108", "--fps", "12"];
+const SIZE: [&str; 4] = ["--size", "192x108", "--fps", "60"];
 /// Two seconds of flight, both ends.
-const FRAMES: usize = 25;
+const FRAMES: usize = 121;
 
 /// A coordinator with a queue, on this address.
 fn coordinator(data: &Path, listen: &str) -> (Running, String) {

@@ -22,7 +22,7 @@ impl Reconnect {
 impl Default for Reconnect {
     /// For ever, after a quarter of a second to 15 seconds.
     fn default() -> Self {
-        let (first, longest) = (Duration::from_millis(250), Duration::from_secs(15));
+        let (first, longest) = (Duration::from_millis(250), Duration::from_secs(5));
         Reconnect { attempts: None, first, longest }
     }
 }
