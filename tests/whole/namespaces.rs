@@ -24,7 +24,13 @@ fn available() -> bool {
         println!("skipped: network namespaces need root");
         return false;
     }
-    let probe = format!("tw{}-probe", std::process::id());
+    if !has_capabilities() {
+        println!(
+            "skipped: this root may not make networks, as in a container without CAP_NET_ADMIN"
+        );
+        return false;
+    }
+    let probe = format!("{}probe", next_name());
     let try_out = || -> Result<(), String> {
         ip(&format!("netns add {probe}"))?;
         ip(&format!("netns del {probe}"))?;
@@ -41,6 +47,22 @@ fn available() -> bool {
     }
 }
 
+/// Whether this process may make networks, and mount what names them.
+fn has_capabilities() -> bool {
+    const NET_ADMIN: u64 = 1 << 12;
+    const SYS_ADMIN: u64 = 1 << 21;
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let held = status.lines().find_map(|line| line.strip_prefix("CapEff:")).unwrap();
+    let held = u64::from_str_radix(held.trim(), 16).unwrap();
+    held & (NET_ADMIN | SYS_ADMIN) == NET_ADMIN | SYS_ADMIN
+}
+
+/// What names of namespaces and links begin with, another for every test: tests run at once.
+fn next_name() -> String {
+    static NAMES: AtomicU32 = AtomicU32::new(0);
+    format!("tw{}-{}", std::process::id(), NAMES.fetch_add(1, Ordering::Relaxed))
+}
+
 /// Runs `ip` with arguments that have no blanks.
 fn ip(arguments: &str) -> Result<(), String> {
     let output = Command::new("ip").args(arguments.split(' ')).output();
@@ -52,17 +74,15 @@ fn ip(arguments: &str) -> Result<(), String> {
 /// PCs on a switch. Goes away with the test, after those that run there, and also where it
 /// fails; what a killed run left is taken away by the next.
 struct Office {
-    /// What names of namespaces and links begin with; at most 11 bytes.
+    /// See [`next_name`]; at most 12 bytes, since names of links have at most 15.
     name: String,
     pcs: usize,
 }
 
 impl Office {
     fn new(pcs: usize) -> Self {
-        static OFFICES: AtomicU32 = AtomicU32::new(0);
         sweep();
-        let number = OFFICES.fetch_add(1, Ordering::Relaxed);
-        let mut office = Office { name: format!("tw{}-{number}", std::process::id()), pcs: 0 };
+        let mut office = Office { name: next_name(), pcs: 0 };
         // The switch has no address: nothing else on this PC is part of the network.
         ip(&format!("link add {} type bridge", office.switch())).unwrap();
         ip(&format!("link set {} up", office.switch())).unwrap();
