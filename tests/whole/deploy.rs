@@ -4,7 +4,7 @@
 //! ssh launcher talks to a real coordinator and real workers through an ssh that stays on
 //! this PC.
 
-use crate::support::{Dir, Running, coordinator, run, succeed, terrafarm};
+use crate::support::{Dir, Running, coordinator, coordinator_with_token, run, succeed, terrafarm};
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::fs;
@@ -206,7 +206,8 @@ fn a_container_is_built_from_every_file_of_the_repository_that_the_program_holds
     }
 }
 
-/// An ssh and an scp that reach "PCs" which are folders; `broken` cannot be reached.
+/// An ssh and an scp that reach "PCs" which are folders; `broken` cannot be reached. Like a
+/// real one, this ssh hands no variable of the farm on.
 struct Office {
     dir: Dir,
 }
@@ -221,7 +222,7 @@ impl Office {
             "#!/bin/sh\n{options}host=$1\nshift\n\
              if [ \"$host\" = broken ]; then\n\
              echo 'ssh: connect to host broken port 22: No route to host' >&2\nexit 255\nfi\n\
-             HOME={}/$host HOST_NAME=$host\nexport HOME HOST_NAME\n\
+             HOME={}/$host HOST_NAME=$host\nexport HOME HOST_NAME\nunset TERRAFARM_TOKEN\n\
              mkdir -p \"$HOME\"\ncd \"$HOME\"\nexec sh -c \"$*\"\n",
             dir.path("").display()
         );
@@ -310,6 +311,36 @@ fn a_crew_is_started_shown_and_stopped_by_ssh_and_hosts_that_fail_are_named() {
     let reachable = office.dir.write("reachable", "pc-two\n");
     let said = succeed(office.launch(&reachable, &address).arg("stop"));
     assert_eq!(said, "pc-two: was not running\n");
+}
+
+#[test]
+fn a_crew_brings_the_token_of_whoever_launches_it() {
+    let office = Office::new();
+    let (mut coordinator, address, token) = coordinator_with_token(&office.dir);
+    let hosts = office.dir.write("hosts", "pc-two 1\n");
+    let launch = || {
+        let mut command = office.launch(&hosts, &address);
+        command.env_remove("TERRAFARM_TOKEN");
+        command
+    };
+    let (said, _) = run(launch().args(["start", "--copy", PROGRAM]), 1);
+    assert!(said.starts_with("pc-two: failed: ") && said.contains("terrafarm token"), "{said}");
+
+    let said = succeed(launch().env("TERRAFARM_TOKEN", &token));
+    assert!(said.starts_with("pc-two: started, process ") && said.ends_with(", connected\n"));
+    let joined = coordinator.expect("worker joined");
+    assert!(joined.contains("pc-two"), "{joined}");
+    // It is in the worker's surroundings, not in what everyone on that PC may read.
+    let pid = said.trim_start_matches("pc-two: started, process ").split(',').next().unwrap();
+    let shown = succeed(Command::new("ps").args(["-o", "args=", "-p", pid]));
+    assert!(shown.contains("worker") && !shown.contains(&token), "{shown}");
+    for file in fs::read_dir(office.dir.path("pc-two").join(".terrafarm")).unwrap() {
+        let held = fs::read(file.unwrap().path()).unwrap();
+        assert!(!held.windows(token.len()).any(|text| text == token.as_bytes()), "it is on disk");
+    }
+    assert_eq!(succeed(launch().arg("stop")), "pc-two: stopped\n");
+    let (said, _) = run(launch().env("TERRAFARM_TOKEN", "'; reboot"), 2);
+    assert!(said.is_empty(), "{said}");
 }
 
 #[test]

@@ -4,7 +4,9 @@
 //! Slurm kills and requeues on its own terms; what is promised is that a crew is there
 //! within seconds and that nothing Slurm does to it shows in a picture.
 
-use crate::support::{Dir, PATIENCE, Running, World, coordinator, frame_hashes, succeed};
+use crate::support::{
+    Dir, PATIENCE, Running, World, coordinator_with_token, frame_hashes, succeed,
+};
 use std::collections::BTreeMap;
 use std::fs;
 use std::net::TcpListener;
@@ -115,8 +117,9 @@ impl Cluster {
     }
 
     /// Submits the crew. Its program says everything, leaves its process number in a file
-    /// named for its job, and ends with the coordinator.
-    fn submit(&self, address: &str) {
+    /// named for its job, and ends with the coordinator. The farm's token is nowhere but in
+    /// the variable that Slurm hands on.
+    fn submit(&self, address: &str, token: &str) {
         let folder = self.dir.path("");
         let program = self.dir.write(
             "terrafarm",
@@ -135,7 +138,9 @@ impl Cluster {
         );
         let array = format!("--array=1-{NODES}");
         let log = self.dir.path("%A_%a.log");
-        succeed(self.slurm("sbatch").args([&array, &export, "-o"]).arg(log).arg(script));
+        let mut sbatch = self.slurm("sbatch");
+        sbatch.env("TERRAFARM_TOKEN", token).args([&array, &export, "-o"]);
+        succeed(sbatch.arg(log).arg(script));
     }
 
     /// Job and node of every worker that Slurm says runs.
@@ -180,9 +185,9 @@ impl Drop for Cluster {
 }
 
 /// Starts a crew of all nodes; returns how long it took until the last had registered.
-fn crew(cluster: &Cluster, coordinator: &mut Running, address: &str) -> Duration {
+fn crew(cluster: &Cluster, coordinator: &mut Running, address: &str, token: &str) -> Duration {
     let since = Instant::now();
-    cluster.submit(address);
+    cluster.submit(address, token);
     for _ in 0..NODES {
         coordinator.expect("worker joined");
     }
@@ -200,13 +205,13 @@ fn a_crew_under_slurm_is_there_in_5_seconds_and_survives_what_slurm_does_to_it()
     succeed(world.render().args(size).args(["--workers", "1", "-o"]).arg(&calm));
 
     let mut cluster = Cluster::start();
-    let (mut coordinator, address) = coordinator();
+    let (mut coordinator, address, token) = coordinator_with_token(&world.dir);
     // A PC that is busy with other tests gets five attempts.
     let attempts = (1..=5).map(|attempt| {
         if attempt > 1 {
             cluster.cancel_all();
         }
-        let took = crew(&cluster, &mut coordinator, &address);
+        let took = crew(&cluster, &mut coordinator, &address, &token);
         println!("attempt {attempt}: {NODES} workers registered after {took:?}");
         took
     });
@@ -219,7 +224,12 @@ fn a_crew_under_slurm_is_there_in_5_seconds_and_survives_what_slurm_does_to_it()
     let output = world.dir.path("farm");
     let manifest = output.join("manifest.json");
     let render = Running::start(
-        world.render().args(size).args(["--coordinator", &address, "-o"]).arg(&output),
+        world
+            .render()
+            .args(size)
+            .env("TERRAFARM_TOKEN", &token)
+            .args(["--coordinator", &address, "-o"])
+            .arg(&output),
     );
     poll("a shot under way", || (cluster.jobs_begun() > 2 * NODES).then_some(()));
 
