@@ -110,7 +110,7 @@ pub struct Progress {
 impl Progress {
     /// Frames that are over.
     pub fn over(self) -> u32 {
-        self.done + self.failed
+        self.done.saturating_add(self.failed)
     }
 
     fn from_row((done, failed, next): (u32, u32, u32)) -> Self {
@@ -261,8 +261,8 @@ impl Ledger {
                 };
                 match record {
                     _ if before => {}
-                    FrameRecord::Done { .. } => progress.done += 1,
-                    FrameRecord::Failed(_) => progress.failed += 1,
+                    FrameRecord::Done { .. } => progress.done = progress.done.saturating_add(1),
+                    FrameRecord::Failed(_) => progress.failed = progress.failed.saturating_add(1),
                 }
                 if matches!(record, FrameRecord::Done { .. }) {
                     progress.last = Some(*index);
