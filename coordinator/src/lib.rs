@@ -12,6 +12,8 @@ mod blobs;
 pub mod client;
 mod driver;
 mod farm;
+#[doc(hidden)]
+pub mod fuzz;
 pub mod order;
 mod peer;
 pub mod queue;
