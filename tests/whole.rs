@@ -22,6 +22,10 @@ mod faults;
 #[path = "whole/queue.rs"]
 mod queue;
 
+/// The record of a night plays again.
+#[path = "whole/journal.rs"]
+mod journal;
+
 /// Terrain that comes from other workers, or damaged.
 #[path = "whole/terrain_on_farm.rs"]
 mod terrain_on_farm;

@@ -307,8 +307,9 @@ pub struct Render {
     /// Shape of the jobs: columns, tiles, or tiles:SIDE
     #[arg(long, value_parser = parse_split, default_value = "columns")]
     pub split: Split,
-    /// Farm to render on [default: local workers]
-    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR")]
+    /// Farm to render on [default: that of TERRAFARM_COORDINATOR, unless --workers or
+    /// --threads is given; else local workers]
+    #[arg(long, value_name = "HOST:PORT")]
     pub coordinator: Option<String>,
     /// How the link to the farm is secured
     #[command(flatten)]
@@ -362,8 +363,12 @@ pub struct Coordinator {
     #[arg(long, value_name = "MIB", default_value_t = 8, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
     pub share_above: u64,
     /// Folder for a queue of shots that outlives whoever submits them, and the coordinator
-    #[arg(long, value_name = "FOLDER")]
+    #[arg(long, value_name = "FOLDER", env = "TERRAFARM_DATA")]
     pub data: Option<PathBuf>,
+    /// File for a record of all that the scheduler is told, 1 GiB at most, to be played again
+    /// with "terrafarm simulate --replay"; if there is such a file, a number is added
+    #[arg(long, value_name = "FILE")]
+    pub journal: Option<PathBuf>,
     /// The page and the API by HTTP
     #[command(flatten)]
     pub web: queue::Web,
@@ -596,7 +601,7 @@ pub struct BenchTerrainSize {
 pub struct BenchScaleOut {
     /// Numbers of workers, with commas [default: 1,2,4,8; with --fake 1,10,100,1000]
     #[arg(long, value_delimiter = ',', value_name = "N",
-        value_parser = clap::value_parser!(u32).range(1..=4096))]
+        value_parser = clap::value_parser!(u32).range(1..=16_384))]
     pub workers: Vec<u32>,
     /// Workers that sleep instead of rendering: how much the coordinator can do
     #[arg(long)]

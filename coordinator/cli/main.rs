@@ -9,6 +9,7 @@
 mod args;
 mod commands;
 mod farm;
+mod files;
 mod input;
 mod lan;
 mod notify;

@@ -1,6 +1,6 @@
 //! The coordinator's JSON API and its page: one router, two carriers.
 //!
-//! `docs/API.md` documents every route. [`serve`](serve::serve) carries it by HTTP, for the
+//! `docs/API.md` documents every route. `serve.rs` carries it by HTTP, for the
 //! page, scripts and Prometheus; `carry` over the encrypted link, for the command line.
 //! Everything here reads views and passes orders on: it decides nothing about the farm.
 //!
@@ -54,6 +54,8 @@ const ORDER_BYTES_MAX: usize = 4 << 10;
 const HASHES_BYTES_MAX: usize = 8 << 20;
 /// Long bodies (blobs and shots) that are taken at once: what they may take of memory.
 const BULKY_AT_ONCE: usize = 4;
+/// Pictures that are read from the disk and made small at once: the largest takes 0.8 GB.
+const PREVIEWS_AT_ONCE: usize = 2;
 /// How long an order may take, its body included.
 const ORDER_LIMIT: Duration = Duration::from_secs(30);
 /// How long a long body may take to come.
@@ -68,6 +70,7 @@ pub struct Desk {
     stop: CancellationToken,
     board: Mutex<Option<Arc<Board>>>,
     bulky: Semaphore,
+    previews: Arc<Semaphore>,
     streams: Arc<Semaphore>,
 }
 
@@ -89,6 +92,7 @@ impl Desk {
             stop,
             board: Mutex::default(),
             bulky: Semaphore::new(BULKY_AT_ONCE),
+            previews: Arc::new(Semaphore::new(PREVIEWS_AT_ONCE)),
             streams: Arc::new(Semaphore::new(live::STREAMS_MAX)),
         })
     }
@@ -118,6 +122,7 @@ pub(crate) fn router(desk: Arc<Desk>) -> Router {
         .route("/api/v1/farm", get(workers::farm))
         .route("/api/v1/workers", get(workers::list))
         .route("/api/v1/workers/{worker}/drain", post(workers::drain))
+        .route("/api/v1/workers/{worker}/clear", post(workers::clear))
         .route("/api/v1/shots", get(shots::list))
         .route("/api/v1/shots/{shot}", get(shots::one))
         .route("/api/v1/shots/{shot}/pause", post(shots::pause))

@@ -1,8 +1,11 @@
 //! The side that asks the coordinator's API over the link of the farm: the same address
 //! and the same token as workers and renders have.
+//!
+//! A coordinator hangs up on a desk that is silent for long, as one is that sends terrain over
+//! other lines: a line that has rested is opened anew with the next question.
 
 use bytes::Bytes;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use terrafarm_wire::limits::{DESK_BODY_MAX, PATH_BYTES_MAX};
 use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Trust};
 use terrafarm_wire::message::{Hello, Message, Request, Role, Verb};
@@ -17,7 +20,12 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(300);
 #[derive(Debug)]
 pub struct Line {
     address: String,
+    trust: Trust,
     connection: Connection<TcpStream>,
+    /// How long it may rest: the coordinator is patient for longer.
+    silence: Duration,
+    /// When it was used last.
+    used: Instant,
     number: u32,
 }
 
@@ -101,9 +109,12 @@ impl Line {
         let peer = stream.peer_addr().map_err(unreachable)?;
         let token = trust.token_for(peer.ip()).map_err(refused)?;
         let hello = Hello::new("desk", Role::Desk);
+        let used = Instant::now();
         let greeted = link::greet(stream, token, hello, GREETING_LIMIT).await;
-        let (connection, _welcome) = greeted.map_err(refused)?;
-        Ok(Line { address: address.to_owned(), connection, number: 0 })
+        let (connection, welcome) = greeted.map_err(refused)?;
+        let (address, trust) = (address.to_owned(), trust.clone());
+        let silence = Duration::from_micros(welcome.silence_us);
+        Ok(Line { address, trust, connection, silence, used, number: 0 })
     }
 
     /// Asks for something; `range` is the first byte of the content and how many.
@@ -124,6 +135,11 @@ impl Line {
                 return Err(AskError::TooLong { what, bytes, most });
             }
         }
+        if self.used.elapsed() >= self.silence {
+            *self = Line::open(&self.address, &self.trust).await?;
+        }
+        // The coordinator's patience begins with the question, not with its answer.
+        self.used = Instant::now();
         self.number = self.number.wrapping_add(1);
         let request = Request { number: self.number, verb, path: path.to_owned(), range, body };
         let exchange = async {
@@ -152,4 +168,30 @@ fn reason(body: &[u8]) -> String {
     let json: Option<serde_json::Value> = serde_json::from_slice(body).ok();
     let said = json.as_ref().and_then(|json| json["error"].as_str());
     said.unwrap_or("the coordinator refused, and did not say why").to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::driver::{Config, run};
+    use tokio::net::TcpListener;
+    use tokio_util::sync::CancellationToken;
+
+    #[tokio::test]
+    async fn a_line_that_has_rested_until_the_coordinator_hung_up_still_asks() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("an address").to_string();
+        let mut config = Config::default();
+        (config.scheduler.heartbeat_us, config.scheduler.silence_us) = (10_000, 50_000);
+        let stop = CancellationToken::new();
+        let serving = tokio::spawn(run(config, listener, stop.clone().cancelled_owned()));
+        let mut line = Line::open(&address, &Trust::Loopback).await.expect("a coordinator");
+        // As one does that sends terrain over other lines meanwhile.
+        let hung_up = line.connection.recv().await;
+        assert!(matches!(hung_up, Ok(None) | Err(_)), "{hung_up:?}");
+        let answer = line.ask(Verb::Get, "/healthz", None, Bytes::new()).await;
+        assert!(answer.is_ok(), "{answer:?}");
+        stop.cancel();
+        serving.await.expect("no panic").expect("no error");
+    }
 }

@@ -105,6 +105,12 @@ impl Broker {
         }
         if let Some(wanted) = self.wanted.get_mut(&hash) {
             wanted.workers.insert(worker, elsewhere);
+            // It may come for another shot, whose client has the blob when that one goes.
+            for &owner in owners {
+                if owner != wanted.asked && !wanted.others.contains(&owner) {
+                    wanted.others.push(owner);
+                }
+            }
             return None;
         }
         if self.wanted.len() >= AWAITED_MAX {
@@ -319,6 +325,19 @@ mod tests {
         assert!(broker.missing(OWNER, hash(1), "no").is_empty(), "it has been asked already");
         let orders = broker.missing(other, hash(1), "no");
         assert_eq!(orders, [Order::Refuse(WorkerId(1), hash(1), "no".into())]);
+    }
+
+    #[test]
+    fn a_client_that_goes_does_not_take_a_blob_from_the_shots_of_others() {
+        let other = ClientId(2);
+        let mut broker = Broker::new(1000);
+        broker.wanted(WorkerId(1), hash(1), true, &[OWNER]);
+        for _ in 0..2 {
+            assert_eq!(broker.wanted(WorkerId(2), hash(1), true, &[OWNER, other]), None);
+        }
+        assert_eq!(broker.client_gone(OWNER), [Order::Ask(other, hash(1))]);
+        let orders = broker.missing(other, hash(1), "no");
+        assert_eq!(orders.len(), 2, "each is asked once: {orders:?}");
     }
 
     #[test]

@@ -15,13 +15,13 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Outbox, Trust};
+use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Outbox, Trust, Unsent};
 use terrafarm_wire::message::{
     Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
     Progress, Role, ShotDone, Submit, WantBlobs, Welcome,
 };
 use tokio::net::TcpStream;
-use tokio::sync::mpsc;
+use tokio::sync::mpsc::{self, error::TrySendError};
 use tokio_util::sync::CancellationToken;
 
 /// How long connecting and greeting may take.
@@ -30,8 +30,9 @@ const GREETING_LIMIT: Duration = Duration::from_secs(5);
 const URGENT_QUEUE: usize = 256;
 /// Blobs that may wait: a few megabytes.
 const BULK_QUEUE: usize = 16;
-/// Questions for blobs that may wait; further ones wait in the socket.
-const WANTS_QUEUE: usize = 64;
+/// Questions for blobs that may wait: as many as a coordinator has blobs to wait for. They
+/// are always read, for whoever does not read does not notice that a coordinator is gone.
+const WANTS_QUEUE: usize = 1 << 16;
 /// The first pause before a lost coordinator is tried again; each further one is twice as
 /// long ...
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -273,19 +274,27 @@ impl Errand {
                         }
                     }
                 }
-                _ = heartbeat.tick() => if let Err(why) = outbox.send(Ping { number: 0 }).await {
-                    break Err(why.into());
+                // A full lane means that the coordinator hears from us in any case.
+                _ = heartbeat.tick() => if outbox.try_send(Ping { number: 0 }) == Err(Unsent::Closed) {
+                    break Err(LinkError::Closed.into());
                 },
                 received = reader.recv_within(silence) => match received {
                     Ok(Some(Message::WantBlobs(want))) => {
-                        let _ = wants.send(want).await;
+                        if let Err(TrySendError::Full(_)) = wants.try_send(want) {
+                            let why = "it asks for more blobs than it can wait for";
+                            break Err(ClientError::Refused(why.into()));
+                        }
                     }
                     Ok(Some(Message::Ping(ping))) => {
-                        if let Err(why) = outbox.send(Pong { number: ping.number }).await {
-                            break Err(why.into());
+                        if outbox.try_send(Pong { number: ping.number }) == Err(Unsent::Closed) {
+                            break Err(LinkError::Closed.into());
                         }
                     }
                     Ok(Some(message)) => match talk.hear(message).map(|said| self.note(said, &asked)) {
+                        // Old news when there is room for it again.
+                        Ok(Some(update @ Update::Progress(_))) => {
+                            let _ = updates.try_send(update);
+                        }
                         Ok(Some(update)) => {
                             // The receiver ends first only when writing failed.
                             if updates.send(update).await.is_err() {
@@ -300,11 +309,19 @@ impl Errand {
                 },
             }
         };
-        let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
         submitting.abort();
         serving.abort();
-        drop(outbox);
-        let _ = tokio::time::timeout(GREETING_LIMIT, writing).await;
+        let stuck = writing.abort_handle();
+        // On a link that is dead, what waits to be sent would wait for ever.
+        if !matches!(result, Err(ClientError::Link(_))) {
+            let farewell = async {
+                let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
+                drop(outbox);
+                writing.await
+            };
+            let _ = tokio::time::timeout(GREETING_LIMIT, farewell).await;
+        }
+        stuck.abort();
         result
     }
 
@@ -503,3 +520,6 @@ fn read_blob(store: &StoreReader, hash: BlobHash) -> Result<Bytes, String> {
     }
     store.read_blob(&hash).map(Bytes::from).map_err(|why| why.to_string())
 }
+
+#[cfg(test)]
+mod tests;

@@ -7,14 +7,16 @@
 use crate::api::{self, Desk, Web};
 use crate::blobs::ClientId;
 use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
+use crate::journal::{self, Journal, JournalError};
 use crate::order::{Order, OrderError};
 use crate::peer::{self, Admission};
-use crate::queue::{Queue, QueueConfig, QueueError};
+use crate::queue::{Queue, QueueConfig, QueueError, QueueTask};
 use crate::thumbnails::Thumbnails;
 use crate::view::FarmView;
 use std::collections::HashMap;
 use std::future::Future;
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -63,6 +65,8 @@ pub struct Config {
     pub scheduler: terrafarm_sched::Config,
     /// The queue on disk, if there is to be one.
     pub queue: Option<QueueConfig>,
+    /// File for a journal of the scheduler, if there is to be one.
+    pub journal: Option<PathBuf>,
 }
 
 impl Default for Config {
@@ -71,13 +75,14 @@ impl Default for Config {
             name: "terrafarm".into(),
             blob_memory_bytes: 512 << 20,
             redirect_above_bytes: 8 << 20,
-            connections_max: 4608,
+            connections_max: 16_896,
             trust: Trust::Loopback,
             strangers_max: 256,
             greeting_limit: Duration::from_secs(5),
             seed: 1,
             scheduler: terrafarm_sched::Config::default(),
             queue: None,
+            journal: None,
         }
     }
 }
@@ -97,61 +102,116 @@ pub enum CoordinatorError {
     /// The queue on disk cannot be used.
     #[error(transparent)]
     Queue(#[from] QueueError),
+    /// The journal cannot be begun.
+    #[error(transparent)]
+    Journal(#[from] JournalError),
 }
 
-/// Serves a farm on a listening socket until `shutdown` is done. Peers are told, and the
-/// function returns when every connection has ended.
+/// Serves a farm on a listening socket until `shutdown` is done, without a page. Peers are
+/// told, and the function returns when every connection has ended.
 ///
 /// # Errors
-/// If the socket or the queue on disk cannot be used at all; refused connections and lost peers are normal
-/// work and only logged.
+/// As [`Coordinator::open`]; refused connections and lost peers are normal work and only
+/// logged.
 pub async fn run(
     config: Config,
     listener: TcpListener,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), CoordinatorError> {
-    run_with_page(config, listener, None, shutdown).await
+    Coordinator::open(config, listener, None).await?.serve(shutdown).await;
+    Ok(())
 }
 
-/// As [`run`], with the API by HTTP and the page.
-///
-/// # Errors
-/// As [`run`].
-pub async fn run_with_page(
+/// A coordinator that has all it needs: nothing keeps it from serving any more.
+pub struct Coordinator {
     config: Config,
     listener: TcpListener,
     web: Option<Web>,
-    shutdown: impl Future<Output = ()>,
-) -> Result<(), CoordinatorError> {
-    let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
-    if matches!(config.trust, Trust::Loopback) && !is_this_pc(address.ip()) {
-        return Err(CoordinatorError::NoToken(address));
-    }
-    let (events, inbox) = mpsc::channel(EVENTS);
-    let stop = CancellationToken::new();
-    let tasks = TaskTracker::new();
-    let (views, view) = watch::channel(Arc::default());
-    let farm = FarmLine { events: events.clone(), view, last_shot: Arc::default() };
-    // First, so that no number of a shot is given twice.
-    let queue = match config.queue.clone() {
-        Some(queue) => {
-            let (queue, task) = Queue::open(queue, farm.clone()).await?;
-            tasks.spawn(task.run(stop.clone()));
-            Some(queue)
+    inbox: mpsc::Receiver<ToDriver>,
+    views: watch::Sender<Arc<FarmView>>,
+    farm: FarmLine,
+    queue: Option<(Queue, QueueTask)>,
+    journal: Option<(Journal, PathBuf)>,
+}
+
+impl Coordinator {
+    /// Takes the folder of the queue and begins the journal, if there are to be such.
+    /// Connections wait until it serves. `web` brings the API by HTTP and the page.
+    ///
+    /// # Errors
+    /// If the socket, the queue on disk or the journal cannot be used.
+    pub async fn open(
+        config: Config,
+        listener: TcpListener,
+        web: Option<Web>,
+    ) -> Result<Self, CoordinatorError> {
+        let address = listener.local_addr().map_err(CoordinatorError::Listener)?;
+        if matches!(config.trust, Trust::Loopback) && !is_this_pc(address.ip()) {
+            return Err(CoordinatorError::NoToken(address));
         }
-        None => None,
-    };
-    let thumbnails = Arc::<Thumbnails>::default();
-    let sight = Sight { views, thumbnails: thumbnails.clone(), unsent: Meter::default() };
-    let last_shot = farm.last_shot.clone();
-    let unsent = sight.unsent.clone();
-    let driver = tasks.spawn(drive(config.clone(), inbox, sight, last_shot, stop.clone()));
-    let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
-    if let Some(web) = web {
-        tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
+        let (events, inbox) = mpsc::channel(EVENTS);
+        let (views, view) = watch::channel(Arc::default());
+        let farm = FarmLine { events, view, last_shot: Arc::default() };
+        // Before any client, so that no number of a shot is given twice.
+        let queue = match config.queue.clone() {
+            Some(queue) => Some(Queue::open(queue, farm.clone()).await?),
+            None => None,
+        };
+        let journal = config.journal.as_deref();
+        let journal = journal.map(|path| journal::begin(path, &config.scheduler, config.seed));
+        let journal = journal.transpose()?;
+        Ok(Coordinator { config, listener, web, inbox, views, farm, queue, journal })
     }
+
+    /// The file of the journal, if there is one.
+    pub fn journal(&self) -> Option<&Path> {
+        self.journal.as_ref().map(|(_, path)| path.as_path())
+    }
+
+    /// Serves until `shutdown` is done. Peers are told, and the function returns when every
+    /// connection has ended.
+    pub async fn serve(self, shutdown: impl Future<Output = ()>) {
+        let Coordinator { config, listener, web, inbox, views, farm, queue, journal } = self;
+        let stop = CancellationToken::new();
+        let tasks = TaskTracker::new();
+        let queue = queue.map(|(queue, task)| {
+            tasks.spawn(task.run(stop.clone()));
+            queue
+        });
+        let thumbnails = Arc::<Thumbnails>::default();
+        let sight = Sight { views, thumbnails: thumbnails.clone(), unsent: Meter::default() };
+        let unsent = sight.unsent.clone();
+        let events = farm.events.clone();
+        let mind = Farm::new(config.scheduler.clone(), config.seed, config.blob_memory_bytes);
+        let mut mind = mind.counted_by(farm.last_shot.clone());
+        mind.redirect_above(config.redirect_above_bytes);
+        if let Some((journal, _)) = journal {
+            mind = mind.recorded_in(journal);
+        }
+        let driver = tasks.spawn(drive(mind, inbox, sight, stop.clone()));
+        let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
+        if let Some(web) = web {
+            tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
+        }
+        let admission = Admission::new(&config, events, api::router(desk), unsent, stop.clone());
+        admit(&listener, &admission, &tasks, shutdown).await;
+        stop.cancel();
+        // The admission holds a way to the driver; the driver ends when the last one is gone.
+        drop(admission);
+        let _ = driver.await;
+        tasks.close();
+        let _ = tokio::time::timeout(FAREWELL, tasks.wait()).await;
+    }
+}
+
+/// Lets peers in until `shutdown` is done.
+async fn admit(
+    listener: &TcpListener,
+    admission: &Admission,
+    tasks: &TaskTracker,
+    shutdown: impl Future<Output = ()>,
+) {
     tokio::pin!(shutdown);
-    let admission = Admission::new(&config, events, api::router(desk), unsent, stop.clone());
     loop {
         tokio::select! {
             () = &mut shutdown => break,
@@ -168,13 +228,6 @@ pub async fn run_with_page(
             },
         }
     }
-    stop.cancel();
-    // The admission holds a way to the driver; the driver ends when the last one is gone.
-    drop(admission);
-    let _ = driver.await;
-    tasks.close();
-    let _ = tokio::time::timeout(FAREWELL, tasks.wait()).await;
-    Ok(())
 }
 
 /// What the driver receives.
@@ -269,17 +322,13 @@ struct Sight {
 }
 
 async fn drive(
-    config: Config,
+    mut farm: Farm,
     mut inbox: mpsc::Receiver<ToDriver>,
     sight: Sight,
-    last_shot: Arc<AtomicU64>,
     stop: CancellationToken,
 ) {
     let epoch = Instant::now();
     let now = || Micros(epoch.elapsed().as_micros() as u64);
-    let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
-    let mut farm = farm.counted_by(last_shot);
-    farm.redirect_above(config.redirect_above_bytes);
     let mut lines: HashMap<Peer, Line> = HashMap::new();
     let mut looks = tokio::time::interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -320,6 +369,7 @@ async fn drive(
             }
         }
     }
+    farm.finish_journal();
     for line in lines.values() {
         let _ = line.outbox.try_send(Goodbye { reason: "the coordinator stops".into() });
         line.hang_up.cancel();
@@ -410,7 +460,9 @@ impl FarmLine {
         let line = FarmLine { events, view, last_shot: Arc::default() };
         let unsent = Meter::default();
         let sight = Sight { views, thumbnails: Arc::default(), unsent };
-        tokio::spawn(drive(config, inbox, sight, line.last_shot.clone(), stop));
+        let farm = Farm::new(config.scheduler, config.seed, config.blob_memory_bytes);
+        let farm = farm.counted_by(line.last_shot.clone());
+        tokio::spawn(drive(farm, inbox, sight, stop));
         line
     }
 

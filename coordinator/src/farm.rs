@@ -10,6 +10,7 @@ mod terrain;
 mod trust;
 
 use crate::blobs::{Broker, ClientId};
+use crate::journal::Journal;
 use crate::shots::{Adoption, FrameHead, Granted, Shots};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
@@ -78,6 +79,8 @@ pub enum Out {
 /// Everything the coordinator knows.
 pub struct Farm {
     scheduler: Scheduler,
+    /// Where all that the scheduler is told is recorded.
+    journal: Option<Journal>,
     broker: Broker,
     workers: BTreeMap<WorkerId, WorkerState>,
     clients: BTreeMap<ClientId, Greeting>,
@@ -114,6 +117,7 @@ impl Farm {
         let is_auditing = scheduler.audit != Share::NONE;
         Farm {
             scheduler: Scheduler::new(scheduler, seed),
+            journal: None,
             broker: Broker::new(blob_memory_bytes),
             workers: BTreeMap::new(),
             clients: BTreeMap::new(),
@@ -132,6 +136,20 @@ impl Farm {
     pub fn counted_by(mut self, last_shot: Arc<AtomicU64>) -> Self {
         self.shots = Shots::counted_by(last_shot);
         self
+    }
+
+    /// Records all that the scheduler is told; the journal has to be one of its settings and
+    /// seed, and nothing must have happened yet.
+    pub fn recorded_in(mut self, journal: Journal) -> Self {
+        self.journal = Some(journal);
+        self
+    }
+
+    /// Writes the rest of the journal. Nothing may happen afterwards.
+    pub fn finish_journal(&mut self) {
+        if let Some(Err(why)) = self.journal.as_mut().map(Journal::finish) {
+            tracing::warn!("{why}");
+        }
     }
 
     /// Sends workers to each other for terrain when more than so many bytes of it wait for
@@ -235,6 +253,7 @@ impl Farm {
                 let pixels_per_s = speed.pixels_per_s;
                 self.schedule(now, Event::WorkerMeasured { worker, pixels_per_s });
             }
+            Message::Status(status) => self.tally.told(worker, status),
             Message::WantBlobs(want) => self.want_blobs(worker, &want),
             Message::Sharing(sharing) => self.shares(worker, sharing.port),
             Message::Goodbye(goodbye) => {
@@ -368,7 +387,7 @@ impl Farm {
         };
         let cost_us = done.report.cost_us;
         let digest = pixels.as_deref().map_or(0, |pixels| self.trust.digest(pixels));
-        self.scheduler.handle(now, Event::JobDone { worker, lease, cost_us, digest });
+        self.tell(now, Event::JobDone { worker, lease, cost_us, digest });
         let verdict = self.scheduler.poll_action();
         match (verdict, pixels) {
             (Some(Action::Accept { shot, frame, region, .. }), Some(pixels)) => {
@@ -417,8 +436,20 @@ impl Farm {
     }
 
     fn schedule(&mut self, now: Micros, event: Event) {
-        self.scheduler.handle(now, event);
+        self.tell(now, event);
         self.obey(now);
+    }
+
+    /// The only way of an event to the scheduler: a journal has to have all of them.
+    fn tell(&mut self, now: Micros, event: Event) {
+        match &mut self.journal {
+            Some(journal) => {
+                if let Err(why) = journal.handle(&mut self.scheduler, now, event) {
+                    tracing::warn!("{why}");
+                }
+            }
+            None => self.scheduler.handle(now, event),
+        }
     }
 
     /// Carries out what the scheduler asks for.
@@ -445,7 +476,7 @@ impl Farm {
                 }
                 Action::FrameComplete { shot, frame } => self.finish_frame(now, shot, frame),
                 Action::FrameFailed { shot, frame, reason } => {
-                    tracing::warn!(%shot, frame, "frame failed: {reason}");
+                    tracing::warn!(%shot, frame = self.number(shot, frame), "frame failed: {reason}");
                     if let Some(state) = self.shots.frame_failed(shot, frame) {
                         let peer = Peer::Client(state.client);
                         let reason = clip_reason(&reason.to_string());

@@ -14,6 +14,7 @@ mod driver;
 mod farm;
 #[doc(hidden)]
 pub mod fuzz;
+mod journal;
 pub mod order;
 mod peer;
 pub mod queue;
@@ -23,4 +24,5 @@ mod strangers;
 mod thumbnails;
 pub mod view;
 
-pub use driver::{Config, CoordinatorError, run, run_with_page};
+pub use driver::{Config, Coordinator, CoordinatorError, run};
+pub use journal::JournalError;

@@ -14,8 +14,9 @@ pub enum Order {
     Cancel(ShotId),
     /// Its priority is another one.
     Prioritise(ShotId, i32),
-    /// A worker that was blocked for a shot gets jobs of it again.
-    Clear(WorkerId, ShotId),
+    /// A worker is believed again, and gets jobs again that it was blocked for: of one shot,
+    /// or of all, and then none needs to be under way.
+    Clear(WorkerId, Option<ShotId>),
     /// A worker finishes what it renders, hands back the rest, and leaves.
     Drain(WorkerId),
     /// Says why a frame is not done.

@@ -167,7 +167,7 @@ pub enum QueueError {
         frame: FrameIndex,
     },
     /// The shot is over.
-    #[error("{shot} is {}; nothing can be changed about it", state_name(*state))]
+    #[error("{shot} is {}; nothing can be changed about it", state.name())]
     Over {
         /// The shot.
         shot: ShotId,
@@ -187,20 +187,6 @@ pub enum QueueError {
 
 fn owner(pid: Option<u32>) -> String {
     pid.map_or("another coordinator".into(), |pid| format!("the coordinator with process {pid}"))
-}
-
-/// The name of a state, as in JSON.
-fn state_name(state: ShotState) -> &'static str {
-    match state {
-        ShotState::Waiting => "waiting",
-        ShotState::Running => "running",
-        ShotState::Paused => "paused",
-        ShotState::Stalled => "stalled",
-        ShotState::Finishing => "finishing",
-        ShotState::Done => "done",
-        ShotState::Failed => "failed",
-        ShotState::Canceled => "canceled",
-    }
 }
 
 /// Where the files of a shot are, or will be.
@@ -385,4 +371,4 @@ async fn blocking<T: Send + 'static>(
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

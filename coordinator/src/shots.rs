@@ -47,6 +47,8 @@ pub struct Shot {
     pub submit: Submit,
     /// One camera a frame, as far as they have arrived.
     pub cameras: Vec<Camera>,
+    /// The number of each frame within the flight, ascending; empty if it is the index.
+    numbers: Vec<FrameIndex>,
     /// When it was submitted.
     pub since: Micros,
     /// When progress was last told.
@@ -66,6 +68,11 @@ pub struct Shot {
 }
 
 impl Shot {
+    /// The number of a frame within the flight, by which people know it.
+    pub fn number(&self, frame: FrameIndex) -> FrameIndex {
+        self.numbers.get(frame as usize).copied().unwrap_or(frame)
+    }
+
     /// What the scheduler is told of it.
     fn submitted(&self, id: ShotId) -> Event {
         Event::ShotSubmitted {
@@ -114,6 +121,8 @@ pub struct Adoption {
     pub submit: Submit,
     /// One camera a frame.
     pub cameras: Vec<Camera>,
+    /// The number of each frame within the flight: not all of it is always missing.
+    pub numbers: Vec<FrameIndex>,
 }
 
 impl Shots {
@@ -176,7 +185,7 @@ impl Shots {
         adoption: Adoption,
         now: Micros,
     ) -> Result<(Accepted, Event), String> {
-        let Adoption { shot, submit, cameras } = adoption;
+        let Adoption { shot, submit, cameras, numbers } = adoption;
         if self.shots.contains_key(&shot) {
             return Err(format!("{shot} is under way already"));
         }
@@ -186,12 +195,14 @@ impl Shots {
         self.check_room(&submit)?;
         let (number, size) = (submit.number, (submit.width, submit.height));
         let sized = cameras.iter().all(|camera| (camera.width, camera.height) == size);
-        if cameras.len() != submit.frames as usize || !sized {
+        let counted = cameras.len() == submit.frames as usize && numbers.len() == cameras.len();
+        if !counted || !sized {
             return Err("the cameras do not fit the shot".into());
         }
         let state = self.insert(shot, client, submit, now);
         state.queued = true;
         state.cameras = cameras;
+        state.numbers = numbers;
         Ok((Accepted { number, shot }, state.submitted(shot)))
     }
 
@@ -224,6 +235,7 @@ impl Shots {
             client,
             queued: false,
             cameras: Vec::new(),
+            numbers: Vec::new(),
             since: now,
             progress_at: now,
             frames_done: 0,
@@ -388,6 +400,7 @@ impl Shots {
         let head = FrameHead {
             shot,
             frame,
+            number: state.number(frame),
             jobs: open.jobs,
             report: open.report,
             check: open.check,
@@ -435,6 +448,7 @@ impl Shots {
 pub struct FrameHead {
     shot: ShotId,
     frame: FrameIndex,
+    number: FrameIndex,
     jobs: u32,
     report: RenderReport,
     check: Option<Summary>,
@@ -442,14 +456,14 @@ pub struct FrameHead {
 }
 
 impl FrameHead {
-    /// Which frame of which shot.
+    /// Which frame of which shot, by its number within the flight.
     pub fn place(&self) -> (ShotId, FrameIndex) {
-        (self.shot, self.frame)
+        (self.shot, self.number)
     }
 
     /// The message with its pixels.
     pub fn with(self, pixels: terrafarm_wire::pixels::Pixels) -> Frame {
-        let FrameHead { shot, frame, jobs, report, check, elapsed_us } = self;
+        let FrameHead { shot, frame, jobs, report, check, elapsed_us, .. } = self;
         Frame { shot, frame, jobs, report, elapsed_us, check, pixels }
     }
 }

@@ -25,6 +25,10 @@ pub struct FarmView {
     pub results_refused: u64,
     /// Frames finished since the start.
     pub frames_done: u64,
+    /// Blobs of terrain that came to workers, or lay there, damaged, since the start.
+    pub blobs_damaged: u64,
+    /// Terrain that workers gave to each other since the start, bytes.
+    pub given_bytes: u64,
     /// How well the farm was used, oldest first; at most [`HISTORY_MAX`].
     pub history: Vec<Sample>,
 }
@@ -66,6 +70,8 @@ pub struct WorkerView {
     pub name: String,
     /// Render threads.
     pub threads: u32,
+    /// How many of them may render now: fewer while it makes room for others on its PC.
+    pub threads_allowed: u32,
     /// What it does.
     pub state: WorkerState,
     /// Its speed, in threads of this farm's average worker.
@@ -88,6 +94,25 @@ pub struct WorkerView {
     pub blocked: Vec<ShotId>,
     /// Whether it is out of the farm, since its pixels differed from those of others.
     pub distrusted: bool,
+    /// What its caches hold; `None` until it has said so.
+    pub cache: Option<CacheView>,
+}
+
+/// The terrain that a worker holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CacheView {
+    /// Decoded in memory, bytes.
+    pub memory_bytes: u64,
+    /// The most that may be there.
+    pub memory_limit_bytes: u64,
+    /// Packed on its disk, bytes; workers of one PC may share that.
+    pub disk_bytes: u64,
+    /// The most that may be there; 0 where nothing is kept.
+    pub disk_limit_bytes: u64,
+    /// Blobs that came or lay damaged since it joined.
+    pub damaged: u64,
+    /// Given to other workers since it joined, bytes.
+    pub given_bytes: u64,
 }
 
 /// One job.
@@ -158,6 +183,8 @@ pub struct ShotView {
     pub eta_s: Option<f64>,
     /// The frame that was finished last, if any.
     pub last_frame: Option<FrameIndex>,
+    /// Whether there is a film to be fetched.
+    pub film: bool,
 }
 
 impl ShotState {

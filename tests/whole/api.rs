@@ -198,6 +198,7 @@ fn a_submitted_shot_is_rendered_without_its_submitter_and_fetched_as_a_local_ren
     );
     assert_eq!((part.status, &part.body[..]), (206, &whole[10..20]));
     assert_eq!(part.header("content-range").unwrap(), format!("bytes 10-19/{}", whole.len()));
+    assert_eq!(office.json(&path)["film"], true);
     let film = world.dir.path("film.mp4");
     succeed(office.ask(&["fetch", &number]).arg("-o").arg(&film));
     assert_eq!(std::fs::read(&film).unwrap(), office.get(&format!("{path}/film.mp4")).body);
@@ -231,6 +232,7 @@ fn orders_by_http_and_by_command_take_effect_and_say_so() {
     assert_eq!(listed["shots"][0]["priority"], 12);
     succeed(&mut office.ask(&["cancel", &number]));
     assert_eq!(office.json(&path)["state"], "canceled");
+    assert_eq!(office.json(&path)["film"], false);
     assert_eq!(post("resume").status, 409, "it is over");
     let over = office.json("/api/v1/shots?state=over");
     assert_eq!((over["total"].as_u64(), over["shots"][0]["id"].as_u64()), (Some(1), Some(shot)));
@@ -248,7 +250,16 @@ fn a_worker_is_listed_by_name_and_leaves_when_it_is_told_to() {
     assert!(succeed(&mut office.ask(&["workers"])).contains("leaving"));
     let (_, said) = run(&mut office.ask(&["drain", "nobody"]), 2);
     assert!(said.contains("no worker is called nobody"), "{said}");
-    assert!(succeed(&mut office.ask(&["clear", "leaving"])).contains("blocked for no shot"));
+    let said = succeed(&mut office.ask(&["clear", "leaving"]));
+    assert!(said.contains("is trusted and gets jobs of every shot again"), "{said}");
+    let (_, said) = run(&mut office.ask(&["clear", "leaving", "--shot", "7"]), 2);
+    assert!(said.contains("shot-7 is not under way"), "{said}");
+    let told = office.wait("/api/v1/workers", |list| !list["workers"][0]["cache"].is_null());
+    let (one, cache) = (&told["workers"][0], &told["workers"][0]["cache"]);
+    assert_eq!((&one["threads"], &one["threads_allowed"]), (&1.into(), &1.into()));
+    assert_eq!((&cache["disk_limit_bytes"], &cache["damaged"]), (&0.into(), &0.into()));
+    assert_eq!(cache["memory_limit_bytes"], 1u64 << 30);
+    assert!(office.get("/metrics").text().contains("terrafarm_blobs_damaged_total 0"));
     succeed(&mut office.ask(&["drain", "leaving"]));
     let (code, lines) = leaving.finish();
     assert_eq!(code, Some(0), "{lines:#?}");
@@ -324,8 +335,8 @@ fn strange_pages_in_a_browser_are_refused() {
     let status = |method: &str, more: &[(&str, &str)]| {
         http(&office.http, method, "/api/v1/farm", more, b"").status
     };
-    assert_eq!(status("GET", &[("Host", "rebound.example:7879")]), 421);
-    assert_eq!(status("GET", &[("Host", "localhost:7879")]), 200);
+    assert_eq!(status("GET", &[("Host", "rebound.example:7071")]), 421);
+    assert_eq!(status("GET", &[("Host", "localhost:7071")]), 200);
     let pause = |more: &[(&str, &str)]| {
         http(&office.http, "POST", "/api/v1/shots/1/pause", more, b"").status
     };

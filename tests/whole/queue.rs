@@ -110,13 +110,28 @@ fn a_coordinator_that_is_killed_again_and_again_finishes_what_was_submitted() {
 fn a_second_coordinator_with_the_same_folder_is_told_who_has_it() {
     let dir = Dir::new();
     let data = dir.path("data");
-    let (_first, address) = coordinator(&data, "127.0.0.1:0");
-    // Its answer says that it has the folder.
-    succeed(terrafarm().args(["shots", "--coordinator", &address]));
+    let (_first, _) = coordinator(&data, "127.0.0.1:0");
     let mut second = terrafarm();
     second.args(["coordinator", "--no-http", "--listen", "127.0.0.1:0", "--data"]).arg(&data);
-    let (_, said) = run(&mut second, 2);
+    let (printed, said) = run(&mut second, 2);
     assert!(said.contains("is in use by the coordinator with process"), "{said}");
+    assert_eq!(printed, "", "nobody is told of a coordinator that does not serve");
+}
+
+#[test]
+fn a_coordinator_without_a_folder_says_what_to_do_and_one_with_the_variable_has_one() {
+    let world = World::new(64);
+    let (_running, address) = crate::support::coordinator();
+    let mut command = terrafarm();
+    command.arg("submit").arg(&world.scene).arg("--flight").arg(&world.flight).args(SIZE);
+    let (_, said) = run(command.args(["--coordinator", &address]), 2);
+    assert!(said.contains("start it with --data FOLDER"), "{said}");
+    let data = world.dir.path("from-variable");
+    let mut command = terrafarm();
+    command.args(["coordinator", "--no-http", "--listen", "127.0.0.1:0"]);
+    let mut named = Running::start(command.env("TERRAFARM_DATA", &data));
+    named.expect("coordinator on ");
+    assert!(data.join("queue.redb").is_file());
 }
 
 #[test]
@@ -127,6 +142,7 @@ fn a_damaged_queue_is_said_to_be_damaged() {
     fs::write(data.join("queue.redb"), b"no records at all").unwrap();
     let mut command = terrafarm();
     command.args(["coordinator", "--no-http", "--listen", "127.0.0.1:0", "--data"]).arg(&data);
-    let (_, said) = run(&mut command, 2);
+    let (printed, said) = run(&mut command, 2);
     assert!(said.contains("queue.redb") && said.contains("move the file away"), "{said}");
+    assert_eq!(printed, "", "nobody is told of a coordinator that does not serve");
 }

@@ -42,7 +42,10 @@ impl Dir {
 /// The program.
 pub fn terrafarm() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_terrafarm"));
-    command.stdin(Stdio::null()).env_remove("TERRAFARM_COORDINATOR").env_remove("TERRAFARM_TOKEN");
+    command.stdin(Stdio::null());
+    for farm in ["TERRAFARM_COORDINATOR", "TERRAFARM_TOKEN", "TERRAFARM_DATA"] {
+        command.env_remove(farm);
+    }
     // The farm of whoever runs the tests is none of theirs.
     let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("no-configuration");
     command.env("HOME", &nowhere).env("XDG_CONFIG_HOME", nowhere);

@@ -265,7 +265,18 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     debug!(pixels_per_s, "tried how fast this worker is");
     let gate = Gate::new(threads);
     let others = Arc::new(Others::new(config.trust.clone(), &config.name));
-    Ok(Site { pool, cache, terrain, caster, gate, pixels_per_s, shelf: None, others, damaged: 0 })
+    Ok(Site {
+        pool,
+        cache,
+        terrain,
+        caster,
+        gate,
+        pixels_per_s,
+        shelf: None,
+        given_bytes: Arc::default(),
+        others,
+        damaged: 0,
+    })
 }
 
 /// Opens the shelf for other workers on the address `own` that the coordinator, `peer`, is
@@ -287,9 +298,10 @@ async fn share<C: Caster>(
         return;
     }
     site.shelf = None;
+    let given = site.given_bytes.clone();
     let mut address = own;
     address.set_port(port);
-    match Shelf::open(address, cache, config.trust.clone(), &config.name).await {
+    match Shelf::open(address, cache, config.trust.clone(), &config.name, given).await {
         Ok(shelf) => {
             info!(address = %shelf.address(), "gives terrain to other workers");
             site.shelf = Some(shelf);

@@ -57,12 +57,14 @@ pub(crate) struct Shelf {
 }
 
 impl Shelf {
-    /// Listens on an address of this PC; port 0 is any free one.
+    /// Listens on an address of this PC; port 0 is any free one. What it gives is added to
+    /// the count of bytes.
     pub async fn open(
         address: SocketAddr,
         cache: Arc<BlobCache>,
         trust: Trust,
         name: &str,
+        given_bytes: Arc<AtomicU64>,
     ) -> io::Result<Shelf> {
         let listener = TcpListener::bind(address).await?;
         let address = listener.local_addr()?;
@@ -71,6 +73,7 @@ impl Shelf {
             trust,
             name: name.to_owned(),
             guests: Arc::new(Semaphore::new(GUESTS_MAX)),
+            given_bytes,
             pace: AsyncMutex::new(Instant::now()),
         });
         let serving = tokio::spawn(house.serve(listener));
@@ -94,6 +97,7 @@ struct House {
     trust: Trust,
     name: String,
     guests: Arc<Semaphore>,
+    given_bytes: Arc<AtomicU64>,
     /// When the next byte may go.
     pace: AsyncMutex<Instant>,
 }
@@ -145,7 +149,13 @@ impl House {
                     None => NoBlob { hash, why: "it is not here".to_owned() }.into(),
                 };
                 match timeout(TAKING_LIMIT, connection.send(&answer)).await {
-                    Ok(sent) => sent?,
+                    Ok(sent) => {
+                        sent?;
+                        if let Message::Blob(blob) = &answer {
+                            let bytes = blob.bytes.len() as u64;
+                            self.given_bytes.fetch_add(bytes, Ordering::Relaxed);
+                        }
+                    }
                     Err(_) => return Err(HandshakeError::TimedOut(TAKING_LIMIT)),
                 }
             }
@@ -219,6 +229,11 @@ impl Others {
     /// Knows nobody yet.
     pub fn new(trust: Trust, name: &str) -> Others {
         Others { trust, name: name.to_owned(), known: Mutex::default(), damaged: AtomicU64::new(0) }
+    }
+
+    /// Blobs of others that were not what they should be.
+    pub fn damaged(&self) -> u64 {
+        self.damaged.load(Ordering::Relaxed)
     }
 
     /// A blob whose hash is right, from the first that gives it.

@@ -6,6 +6,7 @@
 //! once whatever else goes on.
 
 mod early;
+mod status;
 
 use crate::clock::{TaskClock, Worked};
 use crate::office::Gate;
@@ -29,7 +30,7 @@ use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
 use terrafarm_wire::message::{
-    Blob, Done, Grant, OpenShot, Pong, RenderReport, Sharing, Speed, Timesheet, Welcome,
+    Blob, Done, Grant, OpenShot, Pong, RenderReport, Sharing, Speed, Status, Timesheet, Welcome,
 };
 use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -55,6 +56,8 @@ pub(crate) struct Site<C: Caster> {
     pub pixels_per_s: Option<u64>,
     /// Where others may ask for its blobs, if they may.
     pub shelf: Option<Shelf>,
+    /// Terrain that others were given.
+    pub given_bytes: Arc<AtomicU64>,
     pub others: Arc<Others>,
     /// Blobs that the coordinator sent and that were not what they should be.
     pub damaged: u64,
@@ -94,6 +97,10 @@ pub(crate) struct Shift<'a, C: Caster> {
     /// What the outbox had no room for, in order.
     backlog: VecDeque<Message>,
     ended: bool,
+    /// What the coordinator was told last of how this worker is off.
+    told: Option<Status>,
+    /// Damaged blobs, and bytes given to others, before this shift.
+    before: [u64; 2],
     reports: mpsc::Sender<Report<C>>,
     reported: mpsc::Receiver<Report<C>>,
 }
@@ -102,6 +109,7 @@ impl<'a, C: Caster> Shift<'a, C> {
     /// A shift that has not begun. `compress` packs pixels for a network.
     pub fn new(site: &'a mut Site<C>, compress: bool, welcome: &Welcome) -> Self {
         let (reports, reported) = mpsc::channel(REPORTS_MAX);
+        let before = site.damaged_and_given();
         Shift {
             site,
             session: Session::new(),
@@ -113,6 +121,8 @@ impl<'a, C: Caster> Shift<'a, C> {
             unpacking_ns: Arc::default(),
             backlog: VecDeque::new(),
             ended: false,
+            told: None,
+            before,
             reports,
             reported,
         }
@@ -137,6 +147,7 @@ impl<'a, C: Caster> Shift<'a, C> {
         if let Some(shelf) = &self.site.shelf {
             self.backlog.push_back(Sharing { port: shelf.address().port() }.into());
         }
+        let mut looks = status::looks();
         let mut asked_to_stop = false;
         while !(self.ended && self.backlog.is_empty()) {
             let waiting = self.backlog.front().cloned();
@@ -147,6 +158,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                     Err(lost) => Err(lost),
                 },
                 Some(report) = self.reported.recv() => Ok(Some(self.judge(report))),
+                _ = looks.tick() => {
+                    self.tell_status(&outbox);
+                    Ok(None)
+                }
                 sent = send_waiting(&outbox, waiting) => sent.map(|()| {
                     matches!(self.backlog.pop_front(), Some(Message::Done(_))).then_some(Event::Sent)
                 }),

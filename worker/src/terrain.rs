@@ -5,7 +5,7 @@
 //! present job has asked for stay until it ends: so a job always gets further. A tile that
 //! was wrongly forgotten comes back from the cache on disk in about a millisecond.
 //!
-//! Tiles that were fetched before their turn lie in the [`Pantry`], within an eighth of the
+//! Tiles that were fetched before their turn lie in the pantry, within an eighth of the
 //! limit, until the job that is due begins. Room for them is made by tiles that no job has
 //! looked at for long, never by what jobs use; where there is none they stay packed on disk.
 //!
@@ -95,6 +95,11 @@ impl<P> Terrain<P> {
     /// Bytes that decoded tiles take, those before their turn included.
     pub fn bytes(&self) -> u64 {
         self.bytes + self.pantry.bytes()
+    }
+
+    /// The most they may take.
+    pub fn limit_bytes(&self) -> u64 {
+        self.limit_bytes
     }
 
     /// Whether the index of this store is in memory. Marks it as used.

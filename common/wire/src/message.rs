@@ -24,7 +24,7 @@ pub use shot::{
 };
 pub use work::{
     Ahead, CloseShot, Done, Drain, Failed, Grant, HandBack, OpenShot, RenderReport, Revoke, Speed,
-    Timesheet,
+    Status, Timesheet,
 };
 
 use crate::limits::{Class, NAME_BYTES_MAX, REASON_BYTES_MAX};
@@ -262,6 +262,8 @@ messages! {
     HandBack = 0x32, Control;
     /// Worker to coordinator: how fast it is.
     Speed = 0x33, Control;
+    /// Worker to coordinator: what its caches hold, and how many threads it uses.
+    Status = 0x34, Control;
 
     /// Client to coordinator: a new shot.
     Submit = 0x40, Submission;

@@ -9,7 +9,7 @@ use terrafarm_common::region::Split;
 /// The page and the API of `terrafarm coordinator`.
 #[derive(Debug, ClapArgs)]
 pub struct Web {
-    /// Address of the page, the API and the metrics by HTTP [default: 127.0.0.1:7879];
+    /// Address of the page, the API and the metrics by HTTP [default: 127.0.0.1:7071];
     /// where other PCs can reach it, a key is needed
     #[arg(long, value_name = "ADDRESS", conflicts_with = "no_http")]
     pub http: Option<SocketAddr>,
@@ -155,7 +155,7 @@ pub struct Priority {
 pub struct Clear {
     /// Name or number of the worker
     pub worker: String,
-    /// Number of the shot [default: every one that it is blocked for]
+    /// Number of the shot [default: every one, and whether it is trusted at all]
     #[arg(long)]
     pub shot: Option<u64>,
     /// The coordinator to ask

@@ -178,8 +178,18 @@ pub fn workers(args: &args::Workers) -> anyhow::Result<Outcome> {
         if workers.is_empty() {
             return say("no workers");
         }
-        let head =
-            ["worker", "state", "threads", "speed", "renders", "jobs", "rendering %", "name"];
+        let head = [
+            "worker",
+            "state",
+            "threads",
+            "speed",
+            "renders",
+            "jobs",
+            "rendering %",
+            "memory MB",
+            "disk MB",
+            "name",
+        ];
         let rows: Vec<_> = workers.iter().map(worker_row).collect();
         say(table(&head, &rows).trim_end())
     })
@@ -193,10 +203,17 @@ fn worker_row(worker: &WorkerView) -> Vec<String> {
         true => String::new(),
         false => format!(" (blocked for {})", blocked.join(", ")),
     };
+    let damaged = match worker.cache.map_or(0, |cache| cache.damaged) {
+        0 => String::new(),
+        damaged => format!(" ({damaged} blobs were damaged)"),
+    };
     vec![
         worker.id.0.to_string(),
         state.to_owned(),
-        worker.threads.to_string(),
+        match worker.threads_allowed {
+            allowed if allowed < worker.threads => format!("{allowed} of {}", worker.threads),
+            _ => worker.threads.to_string(),
+        },
         digits(worker.speed),
         job.unwrap_or_else(|| "-".into()),
         match worker.jobs_failed {
@@ -204,8 +221,14 @@ fn worker_row(worker: &WorkerView) -> Vec<String> {
             failed => format!("{}, {failed} failed", worker.jobs_done),
         },
         digits(100.0 * worker.rendering),
-        printable(&format!("{}{blocked}", worker.name)),
+        worker.cache.map_or_else(|| "-".into(), |cache| megabytes(cache.memory_bytes)),
+        worker.cache.map_or_else(|| "-".into(), |cache| megabytes(cache.disk_bytes)),
+        printable(&format!("{}{damaged}{blocked}", worker.name)),
     ]
+}
+
+fn megabytes(bytes: u64) -> String {
+    (bytes as f64 / 1e6).round().to_string()
 }
 
 /// A text of a stranger on a terminal: nothing in it moves the cursor or ends the line.
@@ -245,18 +268,11 @@ pub fn clear(args: &args::Clear) -> anyhow::Result<Outcome> {
     runtime()?.block_on(async {
         let mut desk = Desk::open(&args.office).await?;
         let worker = desk.worker(&args.worker).await?;
-        let shots = match args.shot {
-            Some(shot) => vec![shot],
-            None => worker.blocked.iter().map(|shot| shot.0).collect(),
+        let path = match args.shot {
+            Some(shot) => format!("/api/v1/shots/{shot}/workers/{}/unblock", worker.id.0),
+            None => format!("/api/v1/workers/{}/clear", worker.id.0),
         };
-        if shots.is_empty() {
-            return say(&format!("{} is blocked for no shot", worker.id));
-        }
-        for shot in shots {
-            let path = format!("/api/v1/shots/{shot}/workers/{}/unblock", worker.id.0);
-            desk.order(Verb::Post, &path, serde_json::Value::Null).await?;
-        }
-        Ok(Outcome::Done)
+        desk.order(Verb::Post, &path, serde_json::Value::Null).await
     })
 }
 

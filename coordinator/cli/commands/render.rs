@@ -44,12 +44,20 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
             args::Encoder::Builtin => Encoder::BuiltIn,
             args::Encoder::Ffmpeg => Encoder::Ffmpeg,
         },
-        farm: match &args.coordinator {
-            Some(address) => Farm::Remote(address.clone(), secret::to_connect(&args.security)?),
+        farm: match farm_of(args) {
+            Some(address) => Farm::Remote(address, secret::to_connect(&args.security)?),
             None => Farm::Local(Crew::fill(args.workers, args.threads)),
         },
         ..Plan::read(&scene, &choice)?
     })
+}
+
+/// The farm to render on: the environment names one for those who do not say that they
+/// want local workers.
+fn farm_of(args: &args::Render) -> Option<String> {
+    let wants_local = args.workers.is_some() || args.threads.is_some();
+    let usual = || std::env::var("TERRAFARM_COORDINATOR").ok().filter(|_| !wants_local);
+    args.coordinator.clone().or_else(usual)
 }
 
 impl args::Casting {

@@ -1,56 +1,82 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
 use crate::secret::{self, Source};
-use crate::{Outcome, args, lan, notify};
+use crate::{Outcome, args, files, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use terrafarm_coordinator::Config;
 use terrafarm_coordinator::api::{Access, Web, WebKey};
 use terrafarm_coordinator::queue::QueueConfig;
+use terrafarm_coordinator::{Config, Coordinator};
 use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::office::Rules;
 use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig};
 use tokio::net::{TcpListener, TcpStream};
 
 const MIB: u64 = 1 << 20;
+/// Open files that are enough for a thousand workers, and the queue.
+const FILES_ENOUGH: u64 = 1200;
+/// How long threads that wait for a disk may take when the coordinator stops.
+const FAREWELL: Duration = Duration::from_secs(2);
 /// How long the network is listened to before this PC is looked at again.
 const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
-const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7879);
+const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7071);
 
 /// Serves a farm until Ctrl-C or SIGTERM.
 pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
     let web = args.web.http.unwrap_or(HTTP);
     let reachable = !is_this_pc(address.ip()) || !(args.web.no_http || is_this_pc(web.ip()));
+    warn_of_few_files(files::raise_open_files());
     let (trust, source) = secret::to_serve(&args.security, reachable)?;
-    runtime()?.block_on(async {
+    let runtime = runtime()?;
+    let served = runtime.block_on(async {
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; is another coordinator running there?")
         })?;
         let address = listener.local_addr().context("cannot read the address listened on")?;
         let web = listen_http(&args.web, &trust).await?;
-        announce(address, &trust, source.as_ref());
-        let _announced = announce_on_lan(args, address);
-        if let Some(web) = &web {
-            say_where(web)?;
-        }
+        let page = web.as_ref().map(where_it_is).transpose()?;
         let config = Config {
             blob_memory_bytes: (args.blob_memory * MIB) as usize,
             redirect_above_bytes: args.share_above * MIB,
-            trust,
+            trust: trust.clone(),
             queue: args.data.as_deref().map(QueueConfig::new),
+            journal: args.journal.clone(),
             scheduler: terrafarm_sched::Config { audit: args.audit, ..Default::default() },
             ..Config::default()
         };
+        // Nobody is told of a coordinator that cannot use its folder.
+        let coordinator = Coordinator::open(config, listener, web).await?;
+        announce(address, &trust, source.as_ref());
+        if let Some(page) = page {
+            println!("look at it:          {page}");
+        }
+        if let Some(path) = coordinator.journal() {
+            println!("journal:             in {}", path.display());
+        }
+        let _announced = announce_on_lan(args, address);
         let stop = stop_signal();
         notify::ready(&format!("listening on {address}"));
-        terrafarm_coordinator::run_with_page(config, listener, web, told(stop)).await?;
+        coordinator.serve(told(stop)).await;
         Ok(Outcome::Done)
-    })
+    });
+    // What a slow disk holds up is cut off there, as it may be anywhere.
+    runtime.shutdown_timeout(FAREWELL);
+    served
+}
+
+/// A worker takes a file handle; a farm of many should not learn that in the night.
+fn warn_of_few_files(files: Option<u64>) {
+    if let Some(files) = files.filter(|&files| files < FILES_ENOUGH) {
+        eprintln!(
+            "terrafarm: warning: this system lets the coordinator open {files} files, which is less \
+             than as many workers; \"ulimit -n\" or LimitNOFILE= raises that"
+        );
+    }
 }
 
 /// Lets workers on the local network find this coordinator.
@@ -101,16 +127,15 @@ async fn listen_http(args: &args::queue::Web, trust: &Trust) -> anyhow::Result<O
     Ok(Some(Web { listener, access: Access { key, names } }))
 }
 
-/// Says where the page is.
-fn say_where(web: &Web) -> anyhow::Result<()> {
+/// Where the page is, in words.
+fn where_it_is(web: &Web) -> anyhow::Result<String> {
     let address = web.listener.local_addr().context("cannot read the address of the page")?;
     let host = match address.ip().is_unspecified() {
         true => format!("{}:{}", pc_name(), address.port()),
         false => address.to_string(),
     };
     let key = if web.access.key.is_some() { "  (key: terrafarm token --web)" } else { "" };
-    println!("look at it:          http://{host}/{key}");
-    Ok(())
+    Ok(format!("http://{host}/{key}"))
 }
 
 /// Says where the coordinator listens, and the exact lines that others need. The token

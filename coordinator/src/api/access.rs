@@ -8,9 +8,10 @@
 //! Where other PCs can reach the port, every request needs the key, as a bearer token or in
 //! the cookie that the login page sets. The key is derived from the farm token and does not
 //! reveal it. HTTP itself is not encrypted: that is for an SSH tunnel or a proxy with TLS.
+//! Who has not shown it keeps no connection: strangers could else take all that there are.
 
-use super::page;
 use super::refusal::Refusal;
+use super::{in_time, page};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Request, State};
@@ -37,6 +38,8 @@ const WRONG_KEY_PAUSE: Duration = Duration::from_secs(1);
 const WRONG_KEYS: usize = 8;
 /// Longest form that is read, bytes.
 const FORM_BYTES_MAX: usize = 1 << 10;
+/// How long it may take to come.
+const FORM_LIMIT: Duration = Duration::from_secs(10);
 
 /// What lets a browser or a script in. `Debug` does not show it.
 #[derive(Clone)]
@@ -90,6 +93,7 @@ pub(super) fn guard(router: Router, access: Access) -> Router {
     let login = Router::new()
         .route("/login", get(show_login).post(login))
         .layer(DefaultBodyLimit::max(FORM_BYTES_MAX))
+        .layer(middleware::from_fn(|request, next| in_time(FORM_LIMIT, request, next)))
         .with_state(door.clone());
     router
         .merge(login)
@@ -99,16 +103,15 @@ pub(super) fn guard(router: Router, access: Access) -> Router {
 
 async fn let_in(State(door): State<Arc<Door>>, request: Request, next: Next) -> Response {
     if let Err(refused) = door.access.check_source(request.method(), request.headers()) {
-        return refused.into_response();
+        return closing(refused.into_response());
     }
+    let Some(key) = door.access.key.as_ref() else { return next.run(request).await };
     let path = request.uri().path();
     // What has to be seen before the key is given, and tells nothing of the farm.
     let open = ["/login", "/page.css", "/icon.svg", "/healthz"].contains(&path);
-    let Some(key) = door.access.key.as_ref().filter(|_| !open) else {
-        return next.run(request).await;
-    };
     match shown(request.headers()) {
         Some(text) if key.is(text) => next.run(request).await,
+        _ if open => closing(next.run(request).await),
         None if path == "/" => closing(Redirect::to("/login").into_response()),
         None => closing(Refusal::new(StatusCode::UNAUTHORIZED, NEEDS_KEY).into_response()),
         Some(_) if path == "/" => door.pause(Redirect::to("/login").into_response()).await,
@@ -241,6 +244,8 @@ async fn harden(request: Request, next: Next) -> Response {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use axum::body::Body;
+    use tower::ServiceExt;
 
     fn headers(pairs: &[(&'static str, &str)]) -> HeaderMap {
         let pair = |&(name, value): &(&'static str, &str)| {
@@ -265,12 +270,12 @@ mod tests {
     fn only_addresses_and_names_of_this_pc_are_hosts() {
         let access = Access { key: None, names: vec!["PC-One".into()] };
         for host in
-            ["127.0.0.1:7879", "localhost", "[::1]:7879", "pc-one:80", "10.0.0.3", "localhost."]
+            ["127.0.0.1:7071", "localhost", "[::1]:7071", "pc-one:80", "10.0.0.3", "localhost."]
         {
             assert!(access.is_ours(host), "{host}");
         }
         for host in
-            ["", "evil.example", "localhost.evil.example:7879", "pc-one.evil.example", "[x]"]
+            ["", "evil.example", "localhost.evil.example:7071", "pc-one.evil.example", "[x]"]
         {
             assert!(!access.is_ours(host), "{host}");
         }
@@ -280,12 +285,12 @@ mod tests {
     fn pages_of_other_sites_are_refused() {
         let access = Access { key: None, names: Vec::new() };
         let check = |method: Method, more: &[(&'static str, &str)]| {
-            let mut pairs = vec![("host", "127.0.0.1:7879")];
+            let mut pairs = vec![("host", "127.0.0.1:7071")];
             pairs.extend_from_slice(more);
             access.check_source(&method, &headers(&pairs)).is_ok()
         };
         assert!(check(Method::POST, &[]), "scripts send no origin");
-        assert!(check(Method::POST, &[("origin", "http://127.0.0.1:7879")]));
+        assert!(check(Method::POST, &[("origin", "http://127.0.0.1:7071")]));
         assert!(!check(Method::POST, &[("origin", "http://127.0.0.1:8080")]));
         assert!(!check(Method::POST, &[("origin", "null")]));
         assert!(!check(Method::GET, &[("origin", "https://evil.example")]));
@@ -303,6 +308,50 @@ mod tests {
             &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate")]
         ));
         assert!(access.check_source(&Method::GET, &headers(&[("host", "evil.example")])).is_err());
+    }
+
+    /// What is behind the door says "in".
+    fn door(key: &WebKey) -> Router {
+        let access = Access { key: Some(key.clone()), names: Vec::new() };
+        guard(Router::new().route("/healthz", get(|| async { "in" })), access)
+    }
+
+    #[tokio::test]
+    async fn strangers_keep_no_connection() {
+        let key = WebKey::of(&FarmToken::from_bytes([7; 32]));
+        let bearer = format!("Bearer {}", key.as_text());
+        let foreign = ("origin", "http://evil.example");
+        for (path, header, closes) in [
+            ("/healthz", None, true),
+            ("/login", None, true),
+            ("/api/v1/farm", None, true),
+            ("/healthz", Some(foreign), true),
+            ("/healthz", Some(("authorization", bearer.as_str())), false),
+        ] {
+            let mut request = Request::get(path);
+            if let Some((name, value)) = header {
+                request = request.header(name, value);
+            }
+            let request = request.body(Body::empty()).expect("a request");
+            let response = door(&key).oneshot(request).await.expect("infallible");
+            let close = response.headers().get(header::CONNECTION).is_some();
+            assert_eq!(close, closes, "{path} {header:?}");
+        }
+    }
+
+    #[test]
+    fn a_form_that_does_not_come_is_not_waited_for() {
+        let mut runtime = tokio::runtime::Builder::new_current_thread();
+        let runtime = runtime.enable_time().start_paused(true).build().expect("a runtime");
+        runtime.block_on(async {
+            let key = WebKey::of(&FarmToken::from_bytes([7; 32]));
+            let never = tokio_stream::pending::<Result<Bytes, std::io::Error>>();
+            let request = Request::post("/login").body(Body::from_stream(never));
+            let answered = door(&key).oneshot(request.expect("a request"));
+            let answered = tokio::time::timeout(10 * FORM_LIMIT, answered).await;
+            let status = answered.expect("in time").expect("infallible").status();
+            assert_eq!(status, StatusCode::REQUEST_TIMEOUT);
+        });
     }
 
     #[test]

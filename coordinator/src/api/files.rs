@@ -82,7 +82,12 @@ pub(super) async fn last(
         (kept, Some(newest), Some(files)) => {
             let path = files.frame(newest).ok_or_else(none)?;
             let thumbnails = desk.thumbnails.clone();
-            let read = move || thumbnails.read(&shot, newest, &path);
+            let turn = desk.previews.clone().acquire_owned().await;
+            // Whoever asked may go; the picture is in memory until it is made.
+            let read = move || {
+                let _turn = turn;
+                thumbnails.read(&shot, newest, &path)
+            };
             match tokio::task::spawn_blocking(read).await {
                 Ok(Ok(jpeg)) => jpeg,
                 _ => kept.map(|(_, jpeg)| jpeg).ok_or_else(none)?,

@@ -52,6 +52,11 @@ pub(super) async fn metrics(State(desk): State<Arc<Desk>>) -> Response {
         .map(|shot| u64::from(shot.frames.saturating_sub(shot.frames_done + shot.frames_failed)));
     let gauges = [
         ("terrafarm_threads", "Render threads of all workers.", workers.threads as f64),
+        (
+            "terrafarm_threads_allowed",
+            "Render threads that may be used now: workers make room for others on their PC.",
+            workers.threads_allowed as f64,
+        ),
         ("terrafarm_jobs_running", "Jobs that workers hold.", farm.jobs_running as f64),
         (
             "terrafarm_frames_waiting",
@@ -79,6 +84,16 @@ pub(super) async fn metrics(State(desk): State<Arc<Desk>>) -> Response {
             "terrafarm_jobs_repeated_total",
             "Leases that had to be granted again.",
             farm.jobs_repeated,
+        ),
+        (
+            "terrafarm_blobs_damaged_total",
+            "Blobs of terrain that came to workers, or lay there, damaged.",
+            farm.blobs_damaged,
+        ),
+        (
+            "terrafarm_terrain_given_bytes_total",
+            "Terrain that workers gave to each other.",
+            farm.given_bytes,
         ),
         ("terrafarm_results_refused_total", "Results that came too late.", farm.results_refused),
     ];

@@ -46,7 +46,8 @@ impl Refusal {
 
     /// The coordinator has no queue.
     pub fn no_queue() -> Self {
-        let text = "this coordinator keeps no queue; start it with --data FOLDER";
+        let text = "this coordinator keeps no queue; start it with --data FOLDER (or TERRAFARM_DATA), \
+                    or have the shot rendered while you wait: terrafarm render --coordinator";
         Refusal::new(StatusCode::NOT_IMPLEMENTED, text)
     }
 

@@ -151,7 +151,7 @@ pub(super) async fn unblock(
     State(desk): State<Arc<Desk>>,
     Path((shot, worker)): Path<(String, String)>,
 ) -> Answer {
-    done(&desk, Order::Clear(worker_id(&worker)?, shot_id(&shot)?)).await
+    done(&desk, Order::Clear(worker_id(&worker)?, Some(shot_id(&shot)?))).await
 }
 
 /// `GET /api/v1/shots/{shot}/frames/{frame}/why`

@@ -28,6 +28,11 @@ pub(super) async fn drain(State(desk): State<Arc<Desk>>, Path(worker): Path<Stri
     Ok(Json(json!({"done": desk.order(Order::Drain(worker_id(&worker)?)).await?})))
 }
 
+/// `POST /api/v1/workers/{worker}/clear`
+pub(super) async fn clear(State(desk): State<Arc<Desk>>, Path(worker): Path<String>) -> Answer {
+    Ok(Json(json!({"done": desk.order(Order::Clear(worker_id(&worker)?, None)).await?})))
+}
+
 /// `GET /api/v1/farm`
 pub(super) async fn farm(State(desk): State<Arc<Desk>>) -> Answer {
     let board = desk.board();
@@ -60,6 +65,7 @@ impl Desk {
                 "busy": workers.busy,
                 "draining": workers.draining,
                 "threads": workers.threads,
+                "threads_allowed": workers.threads_allowed,
             },
             "shots": shots,
             "jobs_running": farm.jobs_running,
@@ -67,6 +73,8 @@ impl Desk {
             "jobs_repeated": farm.jobs_repeated,
             "results_refused": farm.results_refused,
             "frames_done": farm.frames_done,
+            "blobs_damaged": farm.blobs_damaged,
+            "given_bytes": farm.given_bytes,
             "now": now,
         })
     }
@@ -83,6 +91,8 @@ pub(super) struct WorkerCounts {
     pub draining: usize,
     /// Render threads of all.
     pub threads: u64,
+    /// Those that may render now.
+    pub threads_allowed: u64,
 }
 
 impl WorkerCounts {
@@ -96,6 +106,7 @@ impl WorkerCounts {
                 WorkerState::Draining => counts.draining += 1,
             }
             counts.threads += u64::from(worker.threads);
+            counts.threads_allowed += u64::from(worker.threads_allowed);
         }
         counts
     }

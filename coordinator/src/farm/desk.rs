@@ -4,7 +4,7 @@ use super::tally::ShotTally;
 use super::{Farm, Peer};
 use crate::order::{Order, OrderError};
 use crate::shots::Shot;
-use crate::view::{FarmView, JobView, ShotState, ShotView, WorkerState, WorkerView};
+use crate::view::{CacheView, FarmView, JobView, ShotState, ShotView, WorkerState, WorkerView};
 use terrafarm_common::id::{FrameIndex, ShotId};
 use terrafarm_sched::{Event, Micros, Why};
 use terrafarm_wire::message::{Drain, ShotFailed};
@@ -26,6 +26,8 @@ impl Farm {
             jobs_repeated: account.failed + account.expired + account.lost,
             results_refused: account.refused,
             frames_done: self.tally.frames_done,
+            blobs_damaged: self.tally.blobs_damaged,
+            given_bytes: self.tally.given_bytes,
             shots: shots.collect(),
             history: self.tally.history(),
         }
@@ -61,12 +63,15 @@ impl Farm {
                 Ok(format!("{shot} is canceled"))
             }
             Order::Clear(worker, shot) => {
-                self.known(shot)?;
+                shot.map_or(Ok(()), |shot| self.known(shot))?;
                 if !self.workers.contains_key(&worker) {
                     return Err(OrderError::NoWorker(worker));
                 }
-                self.schedule(now, Event::WorkerCleared { worker, shot: Some(shot) });
-                Ok(format!("{worker} gets jobs of {shot} again"))
+                self.schedule(now, Event::WorkerCleared { worker, shot });
+                Ok(match shot {
+                    Some(shot) => format!("{worker} gets jobs of {shot} again"),
+                    None => format!("{worker} is trusted and gets jobs of every shot again"),
+                })
             }
             Order::Drain(worker) => {
                 if !self.workers.contains_key(&worker) {
@@ -78,6 +83,11 @@ impl Farm {
             }
             Order::Why(shot, frame) => self.why(shot, frame),
         }
+    }
+
+    /// The number of a frame within its flight.
+    pub(super) fn number(&self, shot: ShotId, frame: FrameIndex) -> FrameIndex {
+        self.shots.get(shot).map_or(frame, |shot| shot.number(frame))
     }
 
     fn known(&self, shot: ShotId) -> Result<(), OrderError> {
@@ -118,11 +128,15 @@ impl Farm {
         let view = |(&id, state): (&_, &super::WorkerState)| {
             let first = state.leases.first().and_then(|lease| self.granted.get(lease));
             let tally = self.tally.workers.get(&id);
+            let status = tally.and_then(|tally| tally.status);
+            let threads = state.greeting.threads;
             let [rendering, terrain] = tally.map_or([0.0; 2], |tally| tally.shares(now));
             WorkerView {
                 id,
                 name: state.greeting.name.clone(),
-                threads: state.greeting.threads,
+                threads,
+                threads_allowed: status
+                    .map_or(threads, |status| status.threads_allowed.min(threads)),
                 state: if self.scheduler.is_draining(id) {
                     WorkerState::Draining
                 } else if state.leases.is_empty() {
@@ -133,7 +147,7 @@ impl Farm {
                 speed: self.scheduler.speed_of(id).unwrap_or(1.0),
                 job: first.map(|job| JobView {
                     shot: job.shot,
-                    frame: job.frame,
+                    frame: self.number(job.shot, job.frame),
                     region: [job.region.x, job.region.y, job.region.width, job.region.height],
                 }),
                 jobs_held: state.leases.len() as u32,
@@ -145,6 +159,14 @@ impl Farm {
                 blocked: tally
                     .map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
                 distrusted: self.trust.is_distrusted(&state.greeting.name),
+                cache: status.map(|status| CacheView {
+                    memory_bytes: status.memory_bytes,
+                    memory_limit_bytes: status.memory_limit_bytes,
+                    disk_bytes: status.disk_bytes,
+                    disk_limit_bytes: status.disk_limit_bytes,
+                    damaged: status.damaged,
+                    given_bytes: status.given_bytes,
+                }),
             }
         };
         self.workers.iter().map(view).collect()
@@ -174,7 +196,8 @@ impl Farm {
             submitted_s: wall_s.saturating_sub(now.since(shot.since) / 1_000_000),
             frames_per_s,
             eta_s: will_end.then(|| f64::from(left) / frames_per_s),
-            last_frame: tally.last_frame,
+            last_frame: tally.last_frame.map(|frame| shot.number(frame)),
+            film: false,
         }
     }
 }

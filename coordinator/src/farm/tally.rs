@@ -4,7 +4,7 @@ use crate::view::{HISTORY_MAX, Sample};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
 use terrafarm_sched::Micros;
-use terrafarm_wire::message::Timesheet;
+use terrafarm_wire::message::{Status, Timesheet};
 
 /// How long a sample of the history is, microseconds.
 const SAMPLE_US: u64 = 5_000_000;
@@ -20,6 +20,9 @@ pub struct Tally {
     pub shots: BTreeMap<ShotId, ShotTally>,
     /// Frames finished since the start.
     pub frames_done: u64,
+    /// Blobs that were damaged, and bytes that workers gave to each other, since the start.
+    pub blobs_damaged: u64,
+    pub given_bytes: u64,
     history: VecDeque<Sample>,
     now: Lap,
 }
@@ -45,6 +48,8 @@ pub struct WorkerTally {
     /// Jobs that it failed at.
     pub jobs_failed: u64,
     sheet: Timesheet,
+    /// How it is off, as it said last.
+    pub status: Option<Status>,
     /// Shots that it gets no more of.
     pub blocked: BTreeSet<ShotId>,
 }
@@ -96,6 +101,7 @@ impl Tally {
             jobs_done: 0,
             jobs_failed: 0,
             sheet: Timesheet::default(),
+            status: None,
             blocked: BTreeSet::new(),
         };
         self.workers.insert(worker, tally);
@@ -129,6 +135,18 @@ impl Tally {
         if let Some(tally) = self.workers.get_mut(&worker) {
             tally.jobs_failed += 1;
         }
+    }
+
+    /// A worker said how it is off.
+    pub fn told(&mut self, worker: WorkerId, status: Status) {
+        let Some(tally) = self.workers.get_mut(&worker) else { return };
+        let before = tally.status.replace(status);
+        let [damaged, given] = before.map_or([0; 2], |before| [before.damaged, before.given_bytes]);
+        let sum = |all: &mut u64, now: u64, before: u64| {
+            *all = all.saturating_add(now.saturating_sub(before));
+        };
+        sum(&mut self.blobs_damaged, status.damaged, damaged);
+        sum(&mut self.given_bytes, status.given_bytes, given);
     }
 
     /// A worker gets no more of a shot.
@@ -223,6 +241,29 @@ mod tests {
         assert_eq!(tally.history().len(), HISTORY_MAX);
         tally.advance(Micros(u64::MAX / 2));
         assert_eq!(tally.history().len(), HISTORY_MAX);
+    }
+
+    #[test]
+    fn what_workers_gave_is_summed_over_those_who_left() {
+        let mut tally = Tally::default();
+        let status = |damaged, given_bytes| Status {
+            memory_bytes: 1,
+            memory_limit_bytes: 2,
+            disk_bytes: 3,
+            disk_limit_bytes: 4,
+            damaged,
+            given_bytes,
+            threads_allowed: 1,
+        };
+        for number in [1, 2] {
+            tally.joined(WorkerId(number), Micros(0));
+            tally.told(WorkerId(number), status(1, 100));
+            tally.told(WorkerId(number), status(3, 400));
+            tally.left(WorkerId(number), Micros(1));
+        }
+        assert_eq!((tally.blobs_damaged, tally.given_bytes), (6, 800));
+        tally.told(WorkerId(2), status(9, 9));
+        assert_eq!((tally.blobs_damaged, tally.given_bytes), (6, 800), "it has left");
     }
 
     #[test]

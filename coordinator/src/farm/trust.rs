@@ -67,7 +67,7 @@ impl Farm {
              cooling, then clear it"
         );
         for SentFrames { shot, frames } in sent {
-            let frames = spoken(frames);
+            let frames = spoken(&self.numbered(*shot, frames));
             tracing::error!(
                 %worker, %name, %shot,
                 "audit: {frames} were sent with pixels of it; render them again"
@@ -98,11 +98,28 @@ impl Farm {
     ) {
         let names: Vec<_> = workers.iter().map(|&worker| self.name_of(worker)).collect();
         tracing::error!(
-            %shot, frame, ?region,
+            %shot, frame = self.number(shot, frame), ?region,
             "audit: {} render it differently, and nobody else can tell who is right; add a worker, \
              or render the frame on each of them and compare",
             names.join(" and ")
         );
+    }
+
+    /// Runs of frames by their numbers within the flight.
+    fn numbered(
+        &self,
+        shot: ShotId,
+        runs: &[(FrameIndex, FrameIndex)],
+    ) -> Vec<(FrameIndex, FrameIndex)> {
+        let mut numbered: Vec<(FrameIndex, FrameIndex)> = Vec::new();
+        for frame in runs.iter().flat_map(|&(first, last)| first..=last) {
+            let number = self.number(shot, frame);
+            match numbered.last_mut() {
+                Some((_, last)) if last.checked_add(1) == Some(number) => *last = number,
+                _ => numbered.push((number, number)),
+            }
+        }
+        numbered
     }
 
     fn name_of(&self, worker: WorkerId) -> String {

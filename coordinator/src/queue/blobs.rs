@@ -132,18 +132,19 @@ impl Blobs {
         Ok(None)
     }
 
-    /// The hashes of all blobs of a store, its index first.
+    /// The hashes of all blobs of a store, its index first, and their lengths in bytes.
     ///
     /// # Errors
     /// [`QueueError::Missing`] if its index is not here, [`QueueError::Unfit`] if it is
     /// none.
-    pub fn store(&self, index: BlobHash) -> Result<Vec<BlobHash>, QueueError> {
+    pub fn store(&self, index: BlobHash) -> Result<Vec<(BlobHash, u64)>, QueueError> {
         let bytes = self.read(index)?.ok_or_else(|| QueueError::Missing(vec![index]))?;
         let unfit = |why| QueueError::Unfit(format!("{index} is no index of terrain: {why}"));
         let store = decode_index(&bytes).map_err(unfit)?;
         let levels = store.layers.iter().flat_map(|layer| &layer.levels);
         let tiles = levels.flat_map(|level| &level.entries).filter(|tile| !tile.is_empty());
-        Ok(std::iter::once(index).chain(tiles.map(|tile| tile.hash)).collect())
+        let tiles = tiles.map(|tile| (tile.hash, u64::from(tile.length)));
+        Ok(std::iter::once((index, bytes.len() as u64)).chain(tiles).collect())
     }
 
     /// Makes sure that a store is here, all of it, and stays when the power fails.
@@ -152,6 +153,8 @@ impl Blobs {
     /// [`QueueError::Missing`] with what is not here.
     pub fn complete(&self, index: BlobHash) -> Result<(), QueueError> {
         let all = self.store(index)?;
+        self.remove_torn(&all)?;
+        let all: Vec<_> = all.into_iter().map(|(hash, _)| hash).collect();
         let missing = self.missing(all.clone());
         if !missing.is_empty() {
             return Err(QueueError::Missing(missing));
@@ -174,6 +177,19 @@ impl Blobs {
         Ok(())
     }
 
+    /// Removes blobs that are not as long as they should be: until a shot needs them they are
+    /// not synced, and a power cut leaves their names and not what was in them.
+    fn remove_torn(&self, blobs: &[(BlobHash, u64)]) -> Result<(), QueueError> {
+        for &(hash, length) in blobs {
+            let path = self.path(hash);
+            if fs::metadata(&path).is_ok_and(|facts| facts.len() != length) {
+                tracing::warn!(%hash, "a blob of terrain was never whole; it has to be sent again");
+                fs::remove_file(&path).map_err(|why| self.error("remove", &path, &why))?;
+            }
+        }
+        Ok(())
+    }
+
     /// Removes what no unfinished shot needs and nobody asked for lately, the longest
     /// unused first, until the rest is within its limit. Returns bytes removed.
     ///
@@ -182,7 +198,7 @@ impl Blobs {
     pub fn sweep(&self, in_use: &HashSet<BlobHash>) -> Result<u64, QueueError> {
         let mut needed = HashSet::new();
         for &index in in_use {
-            needed.extend(self.store(index)?.into_iter().map(BlobHash::to_hex));
+            needed.extend(self.store(index)?.into_iter().map(|(hash, _)| hash.to_hex()));
         }
         let now = SystemTime::now();
         let mut idle = Vec::new();

@@ -146,8 +146,8 @@ impl Book {
             Order::Pause(id) => (id, Some(Stage::Paused)),
             Order::Resume(id) => (id, Some(Stage::Open)),
             Order::Cancel(id) => (id, Some(Stage::Canceled)),
-            Order::Prioritise(id, _) | Order::Why(id, _) | Order::Clear(_, id) => (id, None),
-            Order::Drain(_) => return Ok(None),
+            Order::Prioritise(id, _) | Order::Why(id, _) | Order::Clear(_, Some(id)) => (id, None),
+            Order::Clear(_, None) | Order::Drain(_) => return Ok(None),
         };
         let shot = self.shots.get(&id).ok_or(QueueError::NoShot(id))?;
         let mut record = shot.record.clone();
@@ -199,6 +199,12 @@ impl Book {
         } else {
             self.lacking.remove(&id);
         }
+    }
+
+    /// The shots that lack a blob, and which.
+    pub fn all_lacking(&self) -> Vec<(ShotId, BlobHash)> {
+        let lacks = |&id: &ShotId| Some((id, self.shots.get(&id)?.lacks?));
+        self.lacking.iter().filter_map(lacks).collect()
     }
 
     /// The shots that lack this blob.

@@ -32,7 +32,7 @@ use terrafarm_wire::Message;
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// News of its own work that may wait for the task.
 const NEWS: usize = 1024;
@@ -62,6 +62,8 @@ enum News {
     Hung(StayId),
     /// The farm asks for terrain that is not here.
     Lacks(StayId, BlobHash),
+    /// The disk does not read terrain that the farm asks for.
+    Unread(StayId, BlobHash),
     /// A picture was written, or not.
     Stored(Picture, Result<u64, QueueError>),
     /// A shot was finished, or not.
@@ -101,8 +103,8 @@ pub(super) struct Task {
     unwritten: Vec<Picture>,
     /// Why nothing goes on: the disk is full or fails.
     stalled: Option<QueueError>,
-    /// The shot whose film is being made.
-    finishing: Option<(ShotId, CancellationToken)>,
+    /// The shot whose film is being made, and what stops that when it is dropped.
+    finishing: Option<(ShotId, Option<DropGuard>)>,
     /// How often pictures of a shot were found damaged.
     losses: BTreeMap<ShotId, u32>,
     swept: Option<Instant>,
@@ -215,7 +217,12 @@ impl Task {
                     self.leave(shot).await;
                 }
             }
-            News::Lacks(stay, hash) => self.lacks(stay, hash).await,
+            News::Lacks(stay, hash) => {
+                // It may have come since.
+                let is_here = self.shared.blobs.missing(vec![hash]).is_empty();
+                self.lacks(stay, hash, !is_here).await;
+            }
+            News::Unread(stay, hash) => self.lacks(stay, hash, true).await,
             News::Stored(picture, stored) => self.stored(picture, stored).await,
             News::Finished(shot, result) => self.finished(shot, result).await,
             News::Swept(result) => {
@@ -348,7 +355,7 @@ impl Task {
             },
             (ShotState::Paused, _) => "its shot is paused".into(),
             (ShotState::Stalled, _) => format!("its shot cannot go on: {}", view.note),
-            (state, _) => format!("its shot is {}", super::state_name(state)),
+            (state, _) => format!("its shot is {}", state.name()),
         })
     }
 

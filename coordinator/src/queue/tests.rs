@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod full;
-mod house;
+pub(crate) mod house;
 mod killed;
 mod rules;
 
@@ -104,6 +104,42 @@ async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
     assert_eq!(house.queue.shot(shot).unwrap().frames_failed, 0);
 }
 
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_the_disk_does_not_read_is_waited_for_and_fails_no_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let name = land.blobs[1].0.to_hex();
+    house.queue.submit(plan(&land, 3)).await.unwrap();
+    let (blob, aside) = (folder.path().join("blobs").join(&name[..2]).join(&name), "aside");
+    fs::rename(&blob, folder.path().join(aside)).unwrap();
+    // A file that can be opened, and of which the first byte cannot be read.
+    std::os::unix::fs::symlink("/proc/self/mem", &blob).unwrap();
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Stalled).await;
+    fs::rename(folder.path().join(aside), &blob).unwrap();
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    assert_eq!(house.queue.shots()[0].frames_failed, 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_a_power_cut_emptied_is_asked_for_before_the_shot_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let house = house.restart().await;
+    let (torn, _) = land.blobs[1];
+    let name = torn.to_hex();
+    fs::write(folder.path().join("blobs").join(&name[..2]).join(name), b"").unwrap();
+    let refused = house.queue.submit(plan(&land, 1)).await.unwrap_err();
+    assert!(matches!(&refused, QueueError::Missing(blobs) if *blobs == [torn]), "{refused}");
+    land.send(&house.queue).await;
+    house.queue.submit(plan(&land, 1)).await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn damaged_pictures_are_rendered_again_before_the_film_is_made() {
     let folder = tempfile::tempdir().unwrap();
@@ -166,11 +202,13 @@ async fn a_second_coordinator_is_told_who_holds_the_folder() {
 async fn terrain_that_nobody_needs_goes_beyond_its_limit() {
     let folder = tempfile::tempdir().unwrap();
     let land = Land::new(folder.path());
-    let mut config = house::config(folder.path());
-    (config.terrain_cache_bytes, config.terrain_grace) = (0, Duration::ZERO);
-    let house = House::with(config).await;
+    let house = House::open(folder.path()).await;
     land.send(&house.queue).await;
     house.queue.submit(plan(&land, 2)).await.unwrap();
+    // Without grace from here on: before, the first sweep would take what is being sent.
+    let mut config = house.cut_off();
+    (config.terrain_cache_bytes, config.terrain_grace) = (0, Duration::ZERO);
+    let house = House::with(config).await;
     let _worker = house.hire(WorkerId(1)).await;
     until(&house.queue, |list| list[0].state == ShotState::Done).await;
     let all: Vec<_> = land.blobs.iter().map(|(hash, _)| *hash).collect();

@@ -51,14 +51,15 @@ pub struct BlobCache {
     folder: PathBuf,
     limit_bytes: u64,
     account: Mutex<Account>,
+    /// Size of all blobs when the folder was last looked at, and of those added since;
+    /// changed by whoever holds the account, read without waiting for it.
+    total_bytes: AtomicU64,
     damaged: AtomicU64,
 }
 
 #[derive(Debug, Default)]
 struct Account {
-    /// Size of all blobs when the folder was last looked at, and of those added since.
-    total_bytes: u64,
-    /// Size of those added since.
+    /// Size of the blobs added since the folder was last looked at.
     added_bytes: u64,
     /// The last time that was given to a file: times are handed out in strict order.
     last_use: Option<SystemTime>,
@@ -81,6 +82,7 @@ impl BlobCache {
             folder: folder.to_owned(),
             limit_bytes,
             account: Mutex::default(),
+            total_bytes: AtomicU64::new(0),
             damaged: AtomicU64::new(0),
         };
         cache.trim(&mut cache.lock())?;
@@ -92,9 +94,14 @@ impl BlobCache {
         &self.folder
     }
 
-    /// Size of all blobs as this process knows it, bytes.
+    /// The most that all blobs may take, bytes.
+    pub fn limit_bytes(&self) -> u64 {
+        self.limit_bytes
+    }
+
+    /// Size of all blobs as this process knows it, bytes. Never waits for the disk.
     pub fn total_bytes(&self) -> u64 {
-        self.lock().total_bytes
+        self.total_bytes.load(Ordering::Relaxed)
     }
 
     /// Blobs that were found damaged.
@@ -115,8 +122,9 @@ impl BlobCache {
             // Another process may have put a sound one in its place meanwhile; it will be
             // fetched again, which is harmless.
             if fs::remove_file(&path).is_ok() {
-                let mut account = self.lock();
-                account.total_bytes = account.total_bytes.saturating_sub(length);
+                let _account = self.lock();
+                let total = self.total_bytes().saturating_sub(length);
+                self.total_bytes.store(total, Ordering::Relaxed);
             }
             return None;
         }
@@ -155,10 +163,10 @@ impl BlobCache {
         }
         self.write(&path, hash, bytes)?;
         let mut account = self.lock();
-        account.total_bytes += length;
+        let total = self.total_bytes.fetch_add(length, Ordering::Relaxed) + length;
         account.added_bytes += length;
         let unsure = account.added_bytes > self.limit_bytes / SLACK;
-        if account.total_bytes > self.limit_bytes || unsure {
+        if total > self.limit_bytes || unsure {
             self.trim(&mut account)?;
         }
         Ok(())
@@ -186,10 +194,11 @@ impl BlobCache {
     /// some slack. Files that vanish meanwhile were removed by another process.
     fn trim(&self, account: &mut Account) -> Result<(), CacheError> {
         let mut kept = self.scan()?;
-        account.total_bytes = kept.iter().map(|blob| blob.bytes).sum();
+        let mut total = kept.iter().map(|blob| blob.bytes).sum();
+        self.total_bytes.store(total, Ordering::Relaxed);
         account.added_bytes = 0;
         account.last_use = account.last_use.max(kept.iter().map(|blob| blob.last_use).max());
-        if account.total_bytes <= self.limit_bytes {
+        if total <= self.limit_bytes {
             return Ok(());
         }
         let goal = self.limit_bytes - self.limit_bytes / SLACK;
@@ -197,15 +206,16 @@ impl BlobCache {
         // The newest stays even if it alone fills the cache: it was just asked for.
         kept.pop();
         for blob in kept {
-            if account.total_bytes <= goal {
+            if total <= goal {
                 break;
             }
             match fs::remove_file(&blob.path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => {
                     return Err(io_error(&blob.path, error));
                 }
-                _ => account.total_bytes -= blob.bytes,
+                _ => total -= blob.bytes,
             }
+            self.total_bytes.store(total, Ordering::Relaxed);
         }
         Ok(())
     }

@@ -100,12 +100,13 @@ impl Peer {
         self.connection.send(&message.into()).await.unwrap();
     }
 
-    /// The next message that does not say how fast the worker is; `None` at a clean end.
+    /// The next message that does not say how fast the worker is, or how it is off; `None` at
+    /// a clean end.
     pub async fn recv(&mut self) -> Option<Message> {
         loop {
             let received = tokio::time::timeout(PATIENCE, self.connection.recv());
             let message = received.await.expect("the worker says something").unwrap();
-            if !matches!(message, Some(Message::Speed(_))) {
+            if !matches!(message, Some(Message::Speed(_) | Message::Status(_))) {
                 return message;
             }
         }

@@ -387,6 +387,34 @@ impl Body for Speed {
     }
 }
 
+/// How a worker is off: said after the welcome, then when it has changed, at most once a
+/// second. For people only; nothing is decided by it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Status {
+    /// Decoded terrain in memory, bytes.
+    pub memory_bytes: u64,
+    /// The most it may take.
+    pub memory_limit_bytes: u64,
+    /// Terrain in the cache on disk, bytes; other workers may share it.
+    pub disk_bytes: u64,
+    /// The most it may take; 0 where nothing is kept on disk.
+    pub disk_limit_bytes: u64,
+    /// Blobs that came or lay damaged since the welcome.
+    pub damaged: u64,
+    /// Terrain given to other workers since the welcome, bytes.
+    pub given_bytes: u64,
+    /// Threads that may render now, at least 1: fewer than it has while it makes room.
+    pub threads_allowed: u32,
+}
+
+impl Body for Status {
+    own_twin!();
+
+    fn check(&self) -> Result<(), Unfit> {
+        Unfit::unless(self.threads_allowed > 0, "a worker without a thread")
+    }
+}
+
 /// Jobs that were not begun and will not be.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HandBack {

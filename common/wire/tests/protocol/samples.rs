@@ -215,6 +215,16 @@ pub fn all() -> Vec<(String, Message)> {
         Sharing { port: 4711 }.into(),
         Ahead { shot, first: frame, stride: 8, cameras: vec![camera(); 2] }.into(),
         hello(Role::Peer).into(),
+        Status {
+            memory_bytes: 400 << 20,
+            memory_limit_bytes: 1 << 30,
+            disk_bytes: 3 << 30,
+            disk_limit_bytes: 4 << 30,
+            damaged: 2,
+            given_bytes: 70_000,
+            threads_allowed: 15,
+        }
+        .into(),
     ];
     let mut seen = 0;
     let named = messages.into_iter().map(|message| {

@@ -142,6 +142,7 @@ impl Judge {
                 let may_work = self.may_work(*worker, *shot);
                 self.expect(may_work, |v| &mut v.bad_grants, || format!("{worker} got {lease}"));
                 self.held.insert(*lease, (*worker, *shot, *frame));
+                self.held_by.entry(*worker).or_default().insert(*lease);
             }
             Action::Compared { worker, lease, .. } => {
                 let was_awaited = self.awaiting.take() == Some((*worker, *lease));
@@ -344,6 +345,8 @@ impl Judge {
     }
 
     fn gone(&mut self, worker: WorkerId) {
+        // Another connection of the same number is another worker.
+        self.distrusted.remove(&worker);
         if self.workers.remove(&worker).is_none() {
             return;
         }

@@ -3,7 +3,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const HOUR_MS = 3_600_000;
-const MARGIN = { left: 36, right: 8, top: 6, bottom: 18 };
+const MARGIN = { left: 44, right: 8, top: 6, bottom: 18 };
 
 function shape(name, attributes, text) {
   const element = document.createElementNS(SVG, name);

@@ -42,6 +42,7 @@ function duration(seconds) {
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 const rate = (perSecond) => (perSecond >= 10 ? perSecond.toFixed(0) : perSecond.toFixed(perSecond >= 1 ? 1 : 2));
+const size = (bytes) => (bytes >= 999.5e6 ? `${(bytes / 1e9).toFixed(1)} GB` : `${(bytes / 1e6).toFixed(0)} MB`);
 const count = (number) => number.toLocaleString("en").replaceAll(",", " ");
 
 function say(text, bad = false) {
@@ -156,11 +157,11 @@ function showShot(part, shot) {
   part.more.setAttribute("aria-label", `more urgent: ${shot.name}`);
   part.pause.setAttribute("aria-label", `${part.pause.textContent} ${shot.name}`);
   part.cancel.setAttribute("aria-label", `cancel ${shot.name}`);
-  const finished = shot.queued && shot.state === "done";
-  if (part.finished !== finished) {
-    part.finished = finished;
+  const finished = (shot.queued && shot.state === "done" ? ["manifest.json"] : []).concat(shot.film ? ["film.mp4"] : []);
+  if (part.finished !== finished.join()) {
+    part.finished = finished.join();
     const link = (file) => make("a", { href: `/api/v1/shots/${shot.id}/${file}`, textContent: file });
-    part.links.replaceChildren(...(finished ? [link("manifest.json"), link("film.mp4")] : []));
+    part.links.replaceChildren(...finished.map(link));
   }
   showPicture(part, shot);
 }
@@ -177,15 +178,13 @@ function showPicture(part, shot) {
 
 function newWorker(worker) {
   const cell = (className) => make("span", { className, role: "cell" });
-  const part = { name: cell("name"), state: cell("state"), speed: cell("speed"), work: cell("work"), jobs: cell("jobs"), shares: cell("shares"), drain: make("button", { textContent: "drain", title: "finish what it renders and leave" }) };
+  const part = { name: cell("name"), state: cell("state"), speed: cell("speed"), work: cell("work"), jobs: cell("jobs"), shares: cell("shares"), cache: cell("cache"), drain: make("button", { textContent: "drain", title: "finish what it renders and leave" }) };
   twice(part.drain, "drain", "really?", () => ask("POST", `workers/${worker.id}/drain`));
   const action = make("span", { className: "action", role: "cell" }, part.drain);
-  part.unblock = make("button", { textContent: "unblock", hidden: true });
-  part.unblock.addEventListener("click", () => {
-    for (const shot of part.worker.blocked) ask("POST", `shots/${shot}/workers/${worker.id}/unblock`);
-  });
-  action.append(part.unblock);
-  part.element = make("div", { className: "worker", role: "row" }, part.name, part.state, part.speed, part.work, part.jobs, part.shares, action);
+  part.clear = make("button", { textContent: "clear", title: "trust it, and give it jobs of every shot", hidden: true });
+  part.clear.addEventListener("click", () => ask("POST", `workers/${worker.id}/clear`));
+  action.append(part.clear);
+  part.element = make("div", { className: "worker", role: "row" }, part.name, part.state, part.speed, part.work, part.jobs, part.shares, part.cache, action);
   return part;
 }
 
@@ -199,14 +198,29 @@ function showWorker(part, worker) {
   set(part.speed, "textContent", `${worker.speed.toFixed(1)}×`);
   const work = [];
   if (worker.job) work.push(`#${worker.job.shot} frame ${worker.job.frame}` + (worker.jobs_held > 1 ? ` +${worker.jobs_held - 1}` : ""));
+  if (worker.threads_allowed < worker.threads) work.push(`${worker.threads_allowed} of ${worker.threads} threads`);
   if (worker.blocked.length) work.push(`blocked for ${worker.blocked.map((shot) => `#${shot}`).join(", ")}`);
   if (worker.heard_ms > 3000) work.push(`silent for ${duration(worker.heard_ms / 1000)}`);
   set(part.work, "textContent", work.join(" · "));
   set(part.jobs, "textContent", count(worker.jobs_done) + (worker.jobs_failed ? `, ${count(worker.jobs_failed)} failed` : ""));
   set(part.shares, "textContent", `${percent(worker.rendering)} / ${percent(worker.terrain)}`);
+  showCache(part.cache, worker.cache);
   set(part.drain, "disabled", worker.state === "draining");
   part.drain.setAttribute("aria-label", `drain ${worker.name}`);
-  set(part.unblock, "hidden", worker.blocked.length === 0);
+  part.clear.setAttribute("aria-label", `clear ${worker.name}`);
+  set(part.clear, "hidden", worker.blocked.length === 0 && !worker.distrusted);
+}
+
+/// What a worker holds of the terrain, in short; all of it where one points.
+function showCache(cell, cache) {
+  set(cell, "textContent", cache ? `${size(cache.memory_bytes)} / ${size(cache.disk_bytes)}` : "");
+  cell.classList.toggle("bad", Boolean(cache?.damaged));
+  set(cell, "title", cache ? [
+    `memory: ${size(cache.memory_bytes)} of ${size(cache.memory_limit_bytes)}`,
+    cache.disk_limit_bytes ? `disk: ${size(cache.disk_bytes)} of ${size(cache.disk_limit_bytes)}` : "nothing is kept on disk",
+    `${size(cache.given_bytes)} given to other workers`,
+    `${count(cache.damaged)} blobs were damaged`,
+  ].join(", ") : "");
 }
 
 const kinds = {

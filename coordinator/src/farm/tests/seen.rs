@@ -2,8 +2,10 @@
 
 use super::*;
 use crate::order::{Order, OrderError};
+use crate::shots::Adoption;
 use crate::view::{FarmView, ShotState, WorkerState};
 use std::time::Instant;
+use terrafarm_wire::message::Status;
 
 /// Seconds since 1970 began, when the farm is looked at.
 const WALL_S: u64 = 1_800_000_000;
@@ -63,6 +65,69 @@ fn orders_change_what_is_seen_and_unknown_ones_say_what_there_is_not() {
     assert_eq!(seen, None);
     let (gone, _) = order(&mut bench, Order::Pause(shot));
     assert_eq!(gone, Err(OrderError::NoShot(shot)));
+}
+
+#[test]
+fn frames_of_the_queue_are_seen_by_their_numbers_in_the_flight() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 2);
+    bench.join(Peer::Client(CLIENT), 0);
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
+    let adoption = |numbers: Vec<u32>| {
+        let (shot, cameras) = (ShotId(7), vec![camera; 3]);
+        PeerEvent::Adopt(Box::new(Adoption { shot, submit: submission(3), cameras, numbers }))
+    };
+    bench.event(Peer::Client(CLIENT), adoption(vec![117, 140]));
+    assert!(look(&mut bench).shots.is_empty(), "a number is missing");
+    bench.event(Peer::Client(CLIENT), adoption(vec![117, 140, 141]));
+    let view = look(&mut bench);
+    assert_eq!(view.workers[0].job.map(|job| job.frame), Some(117));
+    // Two frames wait to be taken then, so the third is not begun.
+    while let Some(lease) = bench.farm.granted.keys().next().copied() {
+        let Granted { worker: by, region, .. } = bench.farm.granted[&lease];
+        let pixels = Pixels::raw(vec![7; region.area() as usize * 3].into()).unwrap();
+        let (report, timesheet) = (RenderReport::default(), Timesheet::default());
+        bench.say(Peer::Worker(by), Done { lease, pixels, report, timesheet, check: None });
+    }
+    assert_eq!(look(&mut bench).shots[0].last_frame, Some(140));
+}
+
+#[test]
+fn what_a_worker_says_of_its_caches_is_seen() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 8);
+    let view = look(&mut bench);
+    assert_eq!((view.workers[0].threads_allowed, view.workers[0].cache), (8, None));
+    let status = Status {
+        memory_bytes: 10,
+        memory_limit_bytes: 20,
+        disk_bytes: 30,
+        disk_limit_bytes: 40,
+        damaged: 1,
+        given_bytes: 50,
+        threads_allowed: 3,
+    };
+    bench.say(worker(1), status);
+    let view = look(&mut bench);
+    let cache = view.workers[0].cache.unwrap();
+    assert_eq!((view.workers[0].threads_allowed, cache.disk_bytes), (3, 30));
+    assert_eq!((view.blobs_damaged, view.given_bytes), (1, 50));
+    bench.say(worker(1), Status { threads_allowed: 9, ..status });
+    assert_eq!(look(&mut bench).workers[0].threads_allowed, 8, "no more than it has");
+}
+
+#[test]
+fn a_distrusted_worker_is_cleared_when_no_shot_is_under_way() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 2);
+    bench.farm.schedule(bench.now, Event::WorkerDistrusted { worker: WorkerId(1) });
+    assert!(look(&mut bench).workers[0].distrusted);
+    let said = bench.farm.order(bench.now, Order::Clear(WorkerId(1), Some(ShotId(7))));
+    assert_eq!(said, Err(OrderError::NoShot(ShotId(7))));
+    bench.farm.order(bench.now, Order::Clear(WorkerId(1), None)).unwrap();
+    assert!(!look(&mut bench).workers[0].distrusted);
+    let nobody = bench.farm.order(bench.now, Order::Clear(WorkerId(2), None));
+    assert_eq!(nobody, Err(OrderError::NoWorker(WorkerId(2))));
 }
 
 #[test]

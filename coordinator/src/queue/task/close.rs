@@ -88,8 +88,8 @@ impl Task {
     pub async fn give_up(&mut self, shot: ShotId) {
         self.leave(shot).await;
         self.losses.remove(&shot);
-        if let Some((_, stop)) = self.finishing.as_ref().filter(|(other, _)| *other == shot) {
-            stop.cancel();
+        if let Some((_, guard)) = self.finishing.as_mut().filter(|(other, _)| *other == shot) {
+            *guard = None;
         }
         let before = self.unwritten.len();
         self.unwritten.retain(|picture| picture.shot() != shot);
@@ -106,7 +106,8 @@ impl Task {
         let Some(state) = self.book.get(shot) else { return };
         let (record, files) = (state.record.clone(), self.files(shot, &state.record));
         let stop = CancellationToken::new();
-        self.finishing = Some((shot, stop.clone()));
+        // Also stopped with the task: the program does not end before its threads.
+        self.finishing = Some((shot, Some(stop.clone().drop_guard())));
         let (shared, tell) = (self.shared.clone(), self.tell.clone());
         self.errands.spawn(async move {
             let work = tokio::task::spawn_blocking(move || {
@@ -186,6 +187,13 @@ impl Task {
         let refused = self.book.iter().filter(|(_, shot)| shot.refused.is_some());
         for shot in refused.map(|(id, _)| id).collect::<Vec<_>>() {
             self.book.set_refused(shot, None);
+        }
+        for (shot, hash) in self.book.all_lacking() {
+            if self.shared.blobs.missing(vec![hash]).is_empty() {
+                self.book.set_lacks(shot, None);
+                self.sync_pause(shot).await;
+                self.changed.insert(shot);
+            }
         }
         if self.stalled.is_none() {
             return;

@@ -70,6 +70,8 @@ impl Task {
             submitted_s: record.submitted_s,
             frames_per_s,
             eta_s: (frames_per_s > 0.0).then(|| f64::from(left) / frames_per_s),
+            // Of a shot that is done, a note says why there is none.
+            film: record.stage == Stage::Done && plan.film.is_some() && record.note.is_empty(),
             last_frame: shot.progress.last.map(|index| plan.first_frame + index),
         })
     }

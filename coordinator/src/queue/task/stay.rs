@@ -137,12 +137,14 @@ impl Task {
         }
         let name = format!("queue, {shot}");
         let Ok(end) = self.farm.join(id.client(), &name).await else { return };
+        let first = state.record.plan.first_frame;
+        let in_flight = numbers.iter().map(|index| first + index).collect();
         if let Some(stay) = self.stays.get_mut(&id) {
             stay.frames = numbers;
         }
         let (farm, blobs, tell) = (self.farm.clone(), self.shared.blobs.clone(), self.tell.clone());
         self.errands.spawn(attend(id, end, farm, blobs, tell));
-        let adoption = Box::new(Adoption { shot, submit, cameras });
+        let adoption = Box::new(Adoption { shot, submit, cameras, numbers: in_flight });
         let _ = self.farm.tell(id.client(), PeerEvent::Adopt(adoption)).await;
         self.sync_pause(shot).await;
     }
@@ -272,12 +274,11 @@ impl Task {
         stay.is_none_or(|stay| stay.is_done && stay.seen >= stay.frames.len())
     }
 
-    /// Terrain of a shot is not here: it waits until someone sends it.
-    pub async fn lacks(&mut self, id: StayId, hash: BlobHash) {
+    /// Terrain of a shot could not be given: it waits until someone sends it, or it can be
+    /// had again, unless it is here by now.
+    pub async fn lacks(&mut self, id: StayId, hash: BlobHash, waits: bool) {
         let Some(shot) = self.stays.get(&id).map(|stay| stay.shot) else { return };
-        // It may have come since.
-        let is_here = self.shared.blobs.missing(vec![hash]).is_empty();
-        self.book.set_lacks(shot, (!is_here).then_some(hash));
+        self.book.set_lacks(shot, waits.then_some(hash));
         // First its jobs are stopped, else they would fail.
         self.sync_pause(shot).await;
         let why = clip_reason("the queue has it no longer");
@@ -353,7 +354,7 @@ async fn supply(
                 Ok(None) => tell.send(News::Lacks(id, hash)).await.is_ok(),
                 Err(why) => {
                     tracing::error!(%hash, "cannot supply a blob: {why}");
-                    tell.send(News::Lacks(id, hash)).await.is_ok()
+                    tell.send(News::Unread(id, hash)).await.is_ok()
                 }
             };
             if !told {

@@ -1,7 +1,7 @@
 //! kill -9 at random moments: of the task inside this process, and of a whole process that
 //! runs farm, queue and workers.
 
-use super::super::ledger::{FrameRecord, Ledger};
+use super::super::ledger::{FrameRecord, Ledger, ShotRecord, Stage};
 use super::house::{self, House, Land, plan, until, work};
 use super::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -35,6 +35,37 @@ fn recorded(folder: &Path) -> BTreeSet<(ShotId, FrameIndex)> {
         }
     }
     all
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_film_that_is_being_made_does_not_hold_up_the_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let shot = ShotId(1);
+    let mut plan = plan(&land, 1);
+    (plan.film, plan.size) = (Some(Film::Mp4), [1280, 720]);
+    plan.cameras.clear();
+    // Hours of marked pictures: none of them is on the disk.
+    let record = ShotRecord {
+        plan,
+        frames: 1 << 20,
+        submitted_s: 0,
+        stage: Stage::Finishing,
+        note: String::new(),
+        workers: Vec::new(),
+    };
+    let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
+    ledger.add(shot, &record, &[]).unwrap();
+    drop(ledger);
+    fs::create_dir_all(shot_folder(folder.path(), shot)).unwrap();
+    let house = House::open(folder.path()).await;
+    let deadline = Instant::now() + house::PATIENCE;
+    while fs::read_dir(shot_folder(folder.path(), shot)).unwrap().next().is_none() {
+        assert!(Instant::now() < deadline, "the film is not begun");
+        tokio::task::yield_now().await;
+    }
+    // It cannot be opened again before the threads of the one before have ended.
+    house.restart().await.cut_off();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -9,7 +9,7 @@ use super::super::report::{digits, quantile, save, table};
 use super::process;
 use crate::commands::bench::land::Land;
 use crate::commands::runtime;
-use crate::{Outcome, args};
+use crate::{Outcome, args, files};
 use anyhow::{Context, bail, ensure};
 use glam::DVec3;
 use serde::Serialize;
@@ -94,7 +94,7 @@ pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
     let counts = if args.workers.is_empty() { WORKERS.to_vec() } else { args.workers.clone() };
     let jobs = if args.short { args.jobs.min(SHORT_JOBS) } else { args.jobs };
     let most = u64::from(counts.iter().copied().max().unwrap_or(1));
-    if let Some(files) = process::raise_open_files()
+    if let Some(files) = files::raise_open_files()
         && files < most + OTHER_FILES
     {
         bail!(

@@ -1,4 +1,4 @@
-//! What the system tells of processes: CPU time and open files.
+//! What the system tells of processes: CPU time.
 
 /// CPU time that this process has had, all threads, seconds; where the system tells.
 #[cfg(unix)]
@@ -53,25 +53,6 @@ fn ticks(stat: &str) -> Option<u64> {
     let user: u64 = fields.next()?.parse().ok()?;
     let kernel: u64 = fields.next()?.parse().ok()?;
     user.checked_add(kernel)
-}
-
-/// Lets this process, and those that it starts, open as many files as the system allows
-/// them; how many that is, if there is a limit.
-#[cfg(unix)]
-pub fn raise_open_files() -> Option<u64> {
-    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-    let limit = getrlimit(Resource::Nofile);
-    let raised = Rlimit { current: limit.maximum, maximum: limit.maximum };
-    match setrlimit(Resource::Nofile, raised) {
-        Ok(()) => limit.maximum,
-        Err(_) => limit.current,
-    }
-}
-
-/// Windows has no such limit.
-#[cfg(not(unix))]
-pub fn raise_open_files() -> Option<u64> {
-    None
 }
 
 #[cfg(test)]
