@@ -248,6 +248,15 @@ pub struct FarmLine {
     last_shot: Arc<AtomicU64>,
 }
 
+impl FarmLine {
+    /// A line at whose other end nobody is.
+    pub fn to_nobody() -> Self {
+        let (events, _) = mpsc::channel(1);
+        let (_, view) = watch::channel(Arc::default());
+        FarmLine { events, view, last_shot: Arc::default() }
+    }
+}
+
 /// Messages that may wait for a client inside this process, on each lane.
 const INSIDE_QUEUE: usize = 4096;
 

@@ -12,6 +12,8 @@ mod blobs;
 pub mod client;
 mod driver;
 mod farm;
+#[doc(hidden)]
+pub mod fuzz;
 mod journal;
 pub mod order;
 mod peer;

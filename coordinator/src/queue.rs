@@ -43,6 +43,8 @@ use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
+pub(crate) use ledger::{is_frame_on_record, is_shot_on_record};
+
 /// Most shots that are not over.
 pub const SHOTS_MAX: usize = 20_000;
 /// Most shots that are over and still listed; of more, the oldest are forgotten. Their

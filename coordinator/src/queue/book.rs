@@ -66,7 +66,9 @@ impl Shot {
     fn weight(&self) -> (u64, u64) {
         let plan = &self.record.plan;
         let pixels = u64::from(plan.size[0]) * u64::from(plan.size[1]);
-        (self.record.frames.into(), pixels * u64::from(plan.frames_in_flight))
+        // A record that was damaged may say anything; too much is too much.
+        let in_flight = pixels.saturating_mul(u64::from(plan.frames_in_flight));
+        (self.record.frames.into(), in_flight.min(PIXELS_PRESENT_MAX + 1))
     }
 
     /// Whether no frame of it is missing.

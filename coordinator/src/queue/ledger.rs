@@ -110,7 +110,7 @@ pub struct Progress {
 impl Progress {
     /// Frames that are over.
     pub fn over(self) -> u32 {
-        self.done + self.failed
+        self.done.saturating_add(self.failed)
     }
 
     fn from_row((done, failed, next): (u32, u32, u32)) -> Self {
@@ -261,8 +261,8 @@ impl Ledger {
                 };
                 match record {
                     _ if before => {}
-                    FrameRecord::Done { .. } => progress.done += 1,
-                    FrameRecord::Failed(_) => progress.failed += 1,
+                    FrameRecord::Done { .. } => progress.done = progress.done.saturating_add(1),
+                    FrameRecord::Failed(_) => progress.failed = progress.failed.saturating_add(1),
                 }
                 if matches!(record, FrameRecord::Done { .. }) {
                     progress.last = Some(*index);
@@ -484,6 +484,25 @@ impl Drop for Ledger {
     fn drop(&mut self) {
         self.close();
     }
+}
+
+/// Reads a shot from its values, and puts it into a book; for [`crate::fuzz`].
+pub(crate) fn is_shot_on_record(record: &[u8], row: (u32, u32, u32), cameras: &[u8]) -> bool {
+    let Ok(record) = serde_json::from_slice::<ShotRecord>(record) else { return false };
+    let [width, height] = record.plan.size;
+    let valid = unpack(cameras, (width, height)).filter(Camera::is_valid).count();
+    let (id, progress) = (ShotId(1), Progress::from_row(row));
+    let mut book = super::book::Book::new(vec![Saved { id, record, progress }], 1);
+    let _ = book.moves();
+    let _ = book.to_finish();
+    let complete = book.get(id).is_some_and(super::book::Shot::is_complete);
+    book.forget(id);
+    complete || valid > 0
+}
+
+/// Reads what became of a frame; for [`crate::fuzz`].
+pub(crate) fn is_frame_on_record(record: &[u8]) -> bool {
+    serde_json::from_slice::<FrameRecord>(record).is_ok()
 }
 
 fn pack(cameras: &[Camera]) -> Vec<u8> {

@@ -1,6 +1,13 @@
 //! First inputs: small, valid, made here. The fuzzer mutates them.
 
 use std::path::Path;
+use terrafarm_common::accuracy::Share;
+use terrafarm_common::camera::Camera;
+use terrafarm_common::id::BlobHash;
+use terrafarm_common::quality::Quality;
+use terrafarm_common::region::Split;
+use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_coordinator::queue::{Film, ShotPlan, Source};
 
 /// The variable that names the folder to write seeds into.
 const FOLDER: &str = "TERRAFARM_FUZZ_SEEDS";
@@ -25,4 +32,34 @@ pub fn golden_frames() -> Vec<Vec<u8>> {
     let mut paths: Vec<_> = files.map(|file| file.expect("a file").path()).collect();
     paths.sort();
     paths.iter().map(|path| std::fs::read(path).expect("a golden file")).collect()
+}
+
+/// A submission of one frame, as JSON.
+pub fn submission() -> String {
+    let size = (64, 36);
+    let camera = Camera::from_angles([1.0, 0.1, 0.2].into(), 10.0, -20.0, 0.0, 60.0, size);
+    let plan = ShotPlan {
+        name: "hills".to_owned(),
+        priority: 0,
+        index: BlobHash([7; 32]),
+        shading: Shading {
+            sun: None,
+            haze: None,
+            sky: Sky::default(),
+            earth: None,
+            below_ground: [0.0; 3],
+            bare_ground: None,
+        },
+        quality: Quality::default(),
+        check: Share::NONE,
+        size: [size.0, size.1],
+        split: Split::Tiles(64),
+        fps: 25.0,
+        first_frame: 0,
+        cameras: vec![camera],
+        frames_in_flight: 3,
+        film: Some(Film::Mp4),
+        source: Source::default(),
+    };
+    serde_json::to_string(&plan).expect("a plan is plain data")
 }

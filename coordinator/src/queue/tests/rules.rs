@@ -321,3 +321,24 @@ fn shots_that_no_farm_renders_are_refused_with_the_reason() {
     };
     refused(&huge, "choose 4 or fewer");
 }
+
+#[test]
+fn what_a_damaged_record_says_of_a_shot_is_counted_without_overflow() {
+    let dir = tempfile::tempdir().unwrap();
+    let land = Land::new(dir.path());
+    let saved = (1..4).map(|number| {
+        let mut plan = plan(&land, 1);
+        (plan.size, plan.frames_in_flight) = ([u32::MAX; 2], u32::MAX);
+        let (frames, stage) = (u32::MAX, Stage::Open);
+        let (note, workers) = (String::new(), Vec::new());
+        let record = ShotRecord { plan, frames, submitted_s: 7, stage, note, workers };
+        let progress = Progress { done: u32::MAX - 1, failed: 0, last: None };
+        Saved { id: ShotId(number), record, progress }
+    });
+    let mut book = Book::new(saved.collect(), ACTIVE);
+    assert_eq!(book.moves(), [Move::Enter(ShotId(1))]);
+    book.set_present(ShotId(1), true);
+    book.advance(ShotId(1), Progress { done: u32::MAX, failed: u32::MAX, last: None });
+    assert!(book.get(ShotId(1)).unwrap().is_complete());
+    assert!(!book.moves().contains(&Move::Enter(ShotId(1))));
+}
