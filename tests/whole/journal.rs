@@ -50,7 +50,11 @@ fn a_night_with_a_killed_worker_plays_again_from_its_journal() {
         assert!(said.contains("the same ") && said.contains("all invariants hold"), "{said}");
         assert_eq!(report["frames"], FRAMES);
         assert_eq!(report["proved"], report["events"], "a journal that is ended proves all");
-        assert!(report["workers"] == 2 && report["account"]["lost"].as_u64().unwrap() >= 1);
+        // At most one at once: the second came when the first was dead.
+        assert!(
+            report["workers"] == 1 && report["account"]["lost"].as_u64().unwrap() >= 1,
+            "{report}"
+        );
         assert!(report["torn"].is_null());
     }
 }
