@@ -176,6 +176,7 @@ async fn keep_alive(
                 tracing::warn!(worker, %how, "a local worker ended; starting it again");
             }
         }
+        // A program that cannot start must not be started without a pause.
         tokio::time::sleep(RESTART_PAUSE).await;
         child = recruit.start()?;
     }

@@ -191,6 +191,7 @@ pub async fn render(
             return Err(ClientError::Stopped);
         }
         tokio::select! {
+            // Back-off: a coordinator that restarts is not stormed by its clients.
             () = tokio::time::sleep(pause) => {}
             () = stop.cancelled() => return Err(ClientError::Stopped),
         }

@@ -223,6 +223,7 @@ async fn admit(
                 }
                 Err(error) => {
                     tracing::warn!("cannot accept a connection: {error}");
+                    // Out of file handles, say: at once it would only fail again.
                     tokio::time::sleep(ACCEPT_PAUSE).await;
                 }
             },
@@ -383,6 +384,7 @@ fn wall_s() -> u64 {
 
 async fn sleep_until(due: Option<Instant>) {
     match due {
+        // The scheduler's own deadline; an event comes first by the select around this.
         Some(due) => tokio::time::sleep_until(due.into()).await,
         None => std::future::pending().await,
     }

@@ -138,6 +138,7 @@ impl Door {
             let text = "too many wrong keys at once; try again in a second";
             return closing(Refusal::new(StatusCode::TOO_MANY_REQUESTS, text).into_response());
         };
+        // The pause is the purpose: keys are not to be guessed fast.
         tokio::time::sleep(WRONG_KEY_PAUSE).await;
         closing(response)
     }

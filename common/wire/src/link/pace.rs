@@ -180,6 +180,7 @@ mod tests {
             let (near, mut far) = duplex(1 << 20);
             let mut near = Paced::new(near, Some(100_000));
             near.write_all(&[0; 1000]).await.unwrap();
+            // The pause is what is tested; the clock is virtual.
             tokio::time::sleep(Duration::from_secs(60)).await;
             let began = Instant::now();
             near.write_all(&[0; 100_000]).await.unwrap();

@@ -240,6 +240,7 @@ async fn silence_is_noticed_although_the_receive_is_cancelled_all_the_time() {
                 assert!(matches!(lost, Err(LinkError::Silent(_))));
                 break;
             }
+            // What cancels is a virtual clock; nothing waits for a state here.
             () = tokio::time::sleep(Duration::from_secs(1)) => {
                 assert!(began.elapsed() <= silence, "silent for {:?}", began.elapsed());
             }

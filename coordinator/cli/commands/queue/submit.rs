@@ -183,6 +183,7 @@ async fn wait(desk: &mut Desk, shot: ShotId) -> anyhow::Result<ShotView> {
             bar.finish_and_clear();
             return Ok(view);
         }
+        // A person watches: the API is asked now and then, nothing is decided by it.
         tokio::time::sleep(LOOK).await;
     }
 }
