@@ -65,7 +65,8 @@ proptest! {
                 prop_assert!(height <= own + f64::from(patch.lift) + 1e-4, "lifted by {}", patch.lift);
             }
         }
-        prop_assert!(voids > 0 || holes == [0, 0] || level > 5);
+        // Of 33 x 33 posts at level 3, one in 40 is a void at least: none at all is e^-27.
+        prop_assert!(voids > 0 || holes == [0, 0] || level > 3);
         prop_assert!(f64::from(patch.lift) <= share * extent + patch.step + 1e-3);
     }
 
