@@ -4,7 +4,7 @@
 //! the file of `terrafarm token`. Where there is none, links are plain and stay on this PC.
 //! It never stands on a command line that others could list, nor in a log.
 
-use crate::args::Security;
+use crate::args::serve::Security;
 use anyhow::{Context, bail};
 use std::fs::File;
 use std::io::{ErrorKind, Read, Write};

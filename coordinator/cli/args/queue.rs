@@ -1,10 +1,10 @@
 //! Commands about a coordinator's queue and workers, as typed.
 
-use super::{Casting, Security, parse_range, parse_size, parse_split};
+use super::serve::Security;
+use super::shot::Shot;
 use clap::{Args as ClapArgs, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use terrafarm_common::region::Split;
 
 /// The page and the API of `terrafarm coordinator`.
 #[derive(Debug, ClapArgs)]
@@ -28,12 +28,8 @@ pub struct Web {
 #[derive(Debug, ClapArgs)]
 pub struct Office {
     /// The coordinator to ask
-    #[arg(
-        long,
-        value_name = "HOST:PORT",
-        env = "TERRAFARM_COORDINATOR",
-        default_value = "127.0.0.1:7070"
-    )]
+    #[arg(long, value_name = "HOST:PORT", env = "TERRAFARM_COORDINATOR",
+        default_value = super::COORDINATOR)]
     pub coordinator: String,
     /// How the link is secured
     #[command(flatten)]
@@ -43,41 +39,15 @@ pub struct Office {
 /// `terrafarm submit`
 #[derive(Debug, ClapArgs)]
 pub struct Submit {
-    /// Scene file (TOML), or a .terrain store to render with the default light
-    pub scene: PathBuf,
-    /// Flight: CSV keyframes
-    #[arg(long)]
-    pub flight: PathBuf,
+    /// What is rendered
+    #[command(flatten)]
+    pub shot: Shot,
     /// What to call the shot [default: the scene and the flight]
     #[arg(long)]
     pub name: Option<String>,
-    /// Shots of a higher priority get every worker they can use; equals take turns
-    #[arg(long, default_value_t = 0, allow_negative_numbers = true)]
-    pub priority: i32,
     /// Make a film of the frames when they are all there
     #[arg(long, value_enum)]
     pub film: Option<Film>,
-    /// Size of the picture [default: the scene's, else 1280x720]
-    #[arg(long, value_parser = parse_size, value_name = "WxH")]
-    pub size: Option<(u32, u32)>,
-    /// Frames per second of flight [default: the scene's, else 30]
-    #[arg(long)]
-    pub fps: Option<f64>,
-    /// Render these frames only, such as 0..24 (the end is not included)
-    #[arg(long, value_parser = parse_range, value_name = "FIRST..END")]
-    pub frames: Option<(u32, u32)>,
-    /// How rays find the ground and what that may cost
-    #[command(flatten)]
-    pub casting: Casting,
-    /// Samples along each side of a pixel: 2 means 4 a pixel
-    #[arg(long)]
-    pub samples: Option<u32>,
-    /// Shape of the jobs: columns, tiles, or tiles:SIDE
-    #[arg(long, value_parser = parse_split, default_value = "columns")]
-    pub split: Split,
-    /// Frames that may be under way at once [default: 3]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=64))]
-    pub frames_in_flight: Option<u32>,
     /// Wait until the shot is over
     #[arg(long)]
     pub wait: bool,

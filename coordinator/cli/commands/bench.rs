@@ -27,12 +27,12 @@ use crate::Outcome;
 use crate::args;
 
 /// Carries out a bench.
-pub fn run(args: &args::Bench) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::Bench) -> anyhow::Result<Outcome> {
     match args {
-        args::Bench::Core(args) => core::run(args),
-        args::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
-        args::Bench::TerrainSize(args) => terrain_size::run(args),
-        args::Bench::ScaleOut(args) => scale_out::run(args),
-        args::Bench::Stability(args) => stability::run(args),
+        args::bench::Bench::Core(args) => core::run(args),
+        args::bench::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
+        args::bench::Bench::TerrainSize(args) => terrain_size::run(args),
+        args::bench::Bench::ScaleOut(args) => scale_out::run(args),
+        args::bench::Bench::Stability(args) => stability::run(args),
     }
 }

@@ -1,5 +1,6 @@
 //! `terrafarm render`: a scene and a flight become pictures.
 
+use crate::args::shot::{Casting, Shot};
 use crate::farm::Crew;
 use crate::input::scene::Scene;
 use crate::secret;
@@ -20,25 +21,8 @@ pub fn run(args: &args::Render) -> anyhow::Result<Outcome> {
 }
 
 fn plan(args: &args::Render) -> anyhow::Result<Plan> {
-    let scene = read_scene(&args.scene)?;
-    let mut quality = args.casting.over(scene.quality);
-    if let Some(samples) = args.samples {
-        quality.samples_per_side = samples;
-    }
-    let choice = Choice {
-        scene: &args.scene,
-        flight: &args.flight,
-        size: args.size.unwrap_or(scene.size),
-        fps: args.fps.unwrap_or(scene.fps),
-        frames: args.frames,
-    };
     Ok(Plan {
         name: args.output.display().to_string(),
-        quality,
-        check: args.casting.check,
-        split: args.split,
-        frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
-        priority: args.priority,
         output: args.output.clone(),
         encoder: match args.encoder {
             args::Encoder::Builtin => Encoder::BuiltIn,
@@ -48,8 +32,34 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
             Some(address) => Farm::Remote(address, secret::to_connect(&args.security)?),
             None => Farm::Local(Crew::fill(args.workers, args.threads)),
         },
-        ..Plan::read(&scene, &choice)?
+        ..args.shot.plan()?
     })
+}
+
+impl Shot {
+    /// Reads the scene and the flight: what is typed goes before what the scene says.
+    pub fn plan(&self) -> anyhow::Result<Plan> {
+        let scene = read_scene(&self.scene)?;
+        let mut quality = self.casting.over(scene.quality);
+        if let Some(samples) = self.samples {
+            quality.samples_per_side = samples;
+        }
+        let choice = Choice {
+            scene: &self.scene,
+            flight: &self.flight,
+            size: self.size.unwrap_or(scene.size),
+            fps: self.fps.unwrap_or(scene.fps),
+            frames: self.frames,
+        };
+        Ok(Plan {
+            quality,
+            check: self.casting.check,
+            split: self.split,
+            frames_in_flight: self.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
+            priority: self.priority,
+            ..Plan::read(&scene, &choice)?
+        })
+    }
 }
 
 /// The farm to render on: the environment names one for those who do not say that they
@@ -60,7 +70,7 @@ fn farm_of(args: &args::Render) -> Option<String> {
     args.coordinator.clone().or_else(usual)
 }
 
-impl args::Casting {
+impl Casting {
     /// What the scene says, but for what the user says.
     pub fn over(&self, mut quality: Quality) -> Quality {
         if let Some(method) = self.method {
@@ -109,7 +119,7 @@ fn print_check(errors: &Summary) {
 }
 
 /// A scene file, or a bare store with the light that a scene has by default.
-pub(super) fn read_scene(path: &Path) -> anyhow::Result<Scene> {
+fn read_scene(path: &Path) -> anyhow::Result<Scene> {
     if path.extension().is_some_and(|extension| extension == "terrain") {
         // What a scene file of this one line would say.
         let name = path.file_name().unwrap_or_default().to_string_lossy();

@@ -26,7 +26,7 @@ const SEARCH: Duration = Duration::from_secs(3);
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7071);
 
 /// Serves a farm until Ctrl-C or SIGTERM.
-pub fn coordinator(args: &args::Coordinator) -> anyhow::Result<Outcome> {
+pub fn coordinator(args: &args::serve::Coordinator) -> anyhow::Result<Outcome> {
     let address = args.listen;
     let web = args.web.http.unwrap_or(HTTP);
     let reachable = !is_this_pc(address.ip()) || !(args.web.no_http || is_this_pc(web.ip()));
@@ -80,7 +80,10 @@ fn warn_of_few_files(files: Option<u64>) {
 }
 
 /// Lets workers on the local network find this coordinator.
-fn announce_on_lan(args: &args::Coordinator, address: SocketAddr) -> Option<lan::Announcement> {
+fn announce_on_lan(
+    args: &args::serve::Coordinator,
+    address: SocketAddr,
+) -> Option<lan::Announcement> {
     if args.no_announce || is_this_pc(address.ip()) {
         return None;
     }
@@ -189,7 +192,7 @@ fn quoted(path: &str) -> String {
 }
 
 /// Works until Ctrl-C or SIGTERM, or with `--once` until the coordinator goes away.
-pub fn worker(args: args::Worker) -> anyhow::Result<Outcome> {
+pub fn worker(args: args::serve::Worker) -> anyhow::Result<Outcome> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     let mut config = WorkerConfig {
         trust: secret::to_connect(&args.security)?,

@@ -17,14 +17,14 @@ const SHOTS_WITHIN_S: f64 = 30.0;
 const SKEWS: (f64, f64) = (15.0, 9.0);
 
 /// Simulates one night, or replays one, and prints how well the farm was used.
-pub fn run(args: &args::Simulate) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::Simulate) -> anyhow::Result<Outcome> {
     match &args.replay {
         Some(path) => replay(path, args.json.as_deref()),
         None => simulate(args),
     }
 }
 
-fn simulate(args: &args::Simulate) -> anyhow::Result<Outcome> {
+fn simulate(args: &args::bench::Simulate) -> anyhow::Result<Outcome> {
     let config = config(args);
     let report = match &args.journal {
         Some(path) => {
@@ -42,7 +42,7 @@ fn simulate(args: &args::Simulate) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn config(args: &args::Simulate) -> SimConfig {
+fn config(args: &args::bench::Simulate) -> SimConfig {
     let every = Faults::every(FAULTS_WITHIN_S);
     let mut faults = Faults { within_s: FAULTS_WITHIN_S, ..Faults::default() };
     if args.churn {

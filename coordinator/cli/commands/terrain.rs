@@ -2,7 +2,7 @@
 
 mod sample;
 
-use crate::args::{self, HeightUnit, PngEncoding, Terrain};
+use crate::args::terrain::{HeightUnit, Import, PngEncoding, Synth, Terrain};
 use crate::{Outcome, progress};
 use anyhow::{Context, bail};
 use std::cell::RefCell;
@@ -35,7 +35,7 @@ pub fn run(command: Terrain) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn import(args: &args::Import) -> anyhow::Result<()> {
+fn import(args: &Import) -> anyhow::Result<()> {
     refuse_existing(&args.output, args.force)?;
     let elevation_options = OpenOptions {
         content: Some(Content::Heights),
@@ -95,7 +95,7 @@ fn import(args: &args::Import) -> anyhow::Result<()> {
     print_import(args, &done)
 }
 
-fn print_import(args: &args::Import, done: &ImportSummary) -> anyhow::Result<()> {
+fn print_import(args: &Import, done: &ImportSummary) -> anyhow::Result<()> {
     if args.json {
         let reader = StoreReader::open(&args.output)?;
         return print_json(&summary(&reader));
@@ -182,7 +182,7 @@ fn print_info(info: &StoreInfo) {
     println!("file          {:.1} MiB, index {}", info.file_bytes as f64 / MIB, info.hash);
 }
 
-fn synth(args: &args::Synth) -> anyhow::Result<()> {
+fn synth(args: &Synth) -> anyhow::Result<()> {
     let spec = SynthSpec {
         posts: args.size,
         spacing_m: args.spacing,

@@ -10,7 +10,7 @@ use terrafarm_wire::link::FarmToken;
 const LINE_BYTES_MAX: u64 = 4096;
 
 /// Prints the token of this PC, or takes one.
-pub fn run(args: &args::Token) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::serve::Token) -> anyhow::Result<Outcome> {
     let path = match &args.token_file {
         Some(path) => path.clone(),
         None => secret::default_file()?,

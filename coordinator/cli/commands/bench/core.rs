@@ -103,7 +103,7 @@ struct Runs {
 }
 
 /// Measures and prints.
-pub fn run(args: &args::BenchCore) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchCore) -> anyhow::Result<Outcome> {
     let mut report = Report {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),
         clock: clock::KIND,
@@ -127,7 +127,11 @@ pub fn run(args: &args::BenchCore) -> anyhow::Result<Outcome> {
     Ok(if wrong.is_empty() { Outcome::Done } else { Outcome::BrokenPromise })
 }
 
-fn bench_land(land: &Land, args: &args::BenchCore, report: &mut Report) -> anyhow::Result<()> {
+fn bench_land(
+    land: &Land,
+    args: &args::bench::BenchCore,
+    report: &mut Report,
+) -> anyhow::Result<()> {
     let stands = match &args.flight {
         Some(flight) => keyframes(land, flight, args.size)?,
         None => own_cameras(land, args.size)?,
@@ -185,7 +189,7 @@ fn alternate(
     land: &Land,
     stand: &Stand,
     earth: Option<Earth>,
-    args: &args::BenchCore,
+    args: &args::bench::BenchCore,
 ) -> Vec<Runs> {
     let mut all: Vec<Runs> = args
         .methods

@@ -15,6 +15,6 @@ mod real;
 use crate::{Outcome, args};
 
 /// Measures and prints.
-pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchScaleOut) -> anyhow::Result<Outcome> {
     if args.fake { fake::run(args) } else { real::run(args) }
 }

@@ -144,7 +144,7 @@ struct Refused {
 }
 
 /// Measures, prints and draws.
-pub fn run(args: &args::BenchSpeedAccuracy) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchSpeedAccuracy) -> anyhow::Result<Outcome> {
     let extent = if args.short { SHORT } else { FULL };
     let mut report = Report {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),
@@ -181,7 +181,7 @@ pub fn run(args: &args::BenchSpeedAccuracy) -> anyhow::Result<Outcome> {
 fn bench_land(
     land: &Land,
     extent: &Extent,
-    args: &args::BenchSpeedAccuracy,
+    args: &args::bench::BenchSpeedAccuracy,
     report: &mut Report,
 ) -> anyhow::Result<()> {
     for &(name, share, above_m, pitch_deg) in &CAMERAS {

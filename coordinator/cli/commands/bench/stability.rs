@@ -112,7 +112,7 @@ impl Cell {
 }
 
 /// Plays every scene and prints the numbers.
-pub fn run(args: &args::BenchStability) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchStability) -> anyhow::Result<Outcome> {
     let size = if args.short { (97, 55) } else { (641, 361) };
     let mut report = Report {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),

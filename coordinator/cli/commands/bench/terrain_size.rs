@@ -116,7 +116,7 @@ struct Case {
 }
 
 /// Measures and prints.
-pub fn run(args: &args::BenchTerrainSize) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchTerrainSize) -> anyhow::Result<Outcome> {
     let (mut sizes, size) = match args.short {
         true => (SHORT_POSTS.to_vec(), SHORT_SIZE),
         false => (args.posts.clone(), args.size),
@@ -139,7 +139,11 @@ pub fn run(args: &args::BenchTerrainSize) -> anyhow::Result<Outcome> {
     Ok(if report.kept { Outcome::Done } else { Outcome::BrokenPromise })
 }
 
-fn bench(made: &[Made], size: (u32, u32), args: &args::BenchTerrainSize) -> anyhow::Result<Report> {
+fn bench(
+    made: &[Made],
+    size: (u32, u32),
+    args: &args::bench::BenchTerrainSize,
+) -> anyhow::Result<Report> {
     let base = made.iter().find(|made| made.posts == BASE_POSTS).or(made.first());
     let mut report = Report {
         program: format!("terrafarm {}", env!("CARGO_PKG_VERSION")),

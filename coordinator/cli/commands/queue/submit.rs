@@ -2,9 +2,8 @@
 
 use super::{Desk, read, say};
 use crate::args::queue as args;
-use crate::commands::render::read_scene;
 use crate::commands::runtime;
-use crate::shot::{Choice, FRAMES_IN_FLIGHT, Plan};
+use crate::shot::Plan;
 use crate::{Outcome, progress};
 use anyhow::{Context, bail};
 use bytes::Bytes;
@@ -29,7 +28,7 @@ const LOOK: Duration = Duration::from_secs(1);
 
 /// Submits, and waits if told to.
 pub fn run(args: &args::Submit) -> anyhow::Result<Outcome> {
-    let plan = plan(args)?;
+    let plan = args.shot.plan()?;
     let store = plan.store.clone();
     let shot = shot_plan(args, plan);
     runtime()?.block_on(async {
@@ -64,42 +63,26 @@ pub fn run(args: &args::Submit) -> anyhow::Result<Outcome> {
     })
 }
 
-fn plan(args: &args::Submit) -> anyhow::Result<Plan> {
-    let scene = read_scene(&args.scene)?;
-    let mut quality = args.casting.over(scene.quality);
-    if let Some(samples) = args.samples {
-        quality.samples_per_side = samples;
-    }
-    let choice = Choice {
-        scene: &args.scene,
-        flight: &args.flight,
-        size: args.size.unwrap_or(scene.size),
-        fps: args.fps.unwrap_or(scene.fps),
-        frames: args.frames,
-    };
-    Ok(Plan { quality, ..Plan::read(&scene, &choice)? })
-}
-
 fn shot_plan(args: &args::Submit, plan: Plan) -> ShotPlan {
     let size = plan.cameras.first().map_or([0, 0], |camera| [camera.width, camera.height]);
     let stem = |path: &std::path::Path| {
         path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
     };
     let name = args.name.clone();
-    let name = name.unwrap_or_else(|| format!("{} {}", stem(&args.scene), stem(&args.flight)));
+    let name = name.unwrap_or_else(|| format!("{} {}", stem(&plan.scene), stem(&plan.flight)));
     ShotPlan {
         name: clip_name(&name),
-        priority: args.priority,
+        priority: plan.priority,
         index: plan.store.index_blob().0,
         shading: plan.shading,
         quality: plan.quality,
-        check: args.casting.check,
+        check: plan.check,
         size,
-        split: args.split,
+        split: plan.split,
         fps: plan.fps,
         first_frame: plan.first_frame,
         cameras: plan.cameras,
-        frames_in_flight: args.frames_in_flight.unwrap_or(FRAMES_IN_FLIGHT),
+        frames_in_flight: plan.frames_in_flight,
         film: args.film.map(|args::Film::Mp4| Film::Mp4),
         source: Source {
             scene: plan.scene.display().to_string(),

@@ -90,7 +90,7 @@ struct Run {
 }
 
 /// Measures and prints.
-pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchScaleOut) -> anyhow::Result<Outcome> {
     let counts = if args.workers.is_empty() { WORKERS.to_vec() } else { args.workers.clone() };
     let jobs = if args.short { args.jobs.min(SHORT_JOBS) } else { args.jobs };
     let most = u64::from(counts.iter().copied().max().unwrap_or(1));

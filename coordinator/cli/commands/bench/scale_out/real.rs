@@ -133,7 +133,7 @@ struct Pass {
 }
 
 /// Measures and prints.
-pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
+pub fn run(args: &args::bench::BenchScaleOut) -> anyhow::Result<Outcome> {
     let crews = crews(args)?;
     let (size, frames) = match args.short {
         true => (SHORT_SIZE, SHORT_FRAMES),
@@ -173,7 +173,7 @@ pub fn run(args: &args::BenchScaleOut) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn crews(args: &args::BenchScaleOut) -> anyhow::Result<Vec<Crew>> {
+fn crews(args: &args::bench::BenchScaleOut) -> anyhow::Result<Vec<Crew>> {
     let counts = match (args.workers.is_empty(), args.short) {
         (true, true) => WORKERS[..2].to_vec(),
         (true, false) => WORKERS.to_vec(),
@@ -189,7 +189,7 @@ fn crews(args: &args::BenchScaleOut) -> anyhow::Result<Vec<Crew>> {
 }
 
 /// Eroded mountains with a photo, kept in a folder if one is named.
-fn land(args: &args::BenchScaleOut) -> anyhow::Result<Land> {
+fn land(args: &args::bench::BenchScaleOut) -> anyhow::Result<Land> {
     let spec = if args.short { SHORT_LAND } else { LAND };
     let Some(folder) = &args.stores else { return Land::synth(spec) };
     std::fs::create_dir_all(folder)
