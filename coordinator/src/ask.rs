@@ -4,15 +4,14 @@
 //! A coordinator hangs up on a desk that is silent for long, as one is that sends terrain over
 //! other lines: a line that has rested is opened anew with the next question.
 
+use crate::dial::{DialError, dial};
 use bytes::Bytes;
 use std::time::{Duration, Instant};
 use terrafarm_wire::limits::{DESK_BODY_MAX, PATH_BYTES_MAX};
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Trust};
-use terrafarm_wire::message::{Hello, Message, Request, Role, Verb};
+use terrafarm_wire::link::{Connection, LinkError, Trust};
+use terrafarm_wire::message::{Message, Request, Role, Verb};
 use tokio::net::TcpStream;
 
-/// How long connecting and greeting may take.
-const GREETING_LIMIT: Duration = Duration::from_secs(5);
 /// How long an answer may take: that of the longest submission, and some.
 const ANSWER_LIMIT: Duration = Duration::from_secs(300);
 
@@ -41,25 +40,9 @@ pub struct Answer {
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// Nobody is there.
-    #[error(
-        "cannot reach coordinator {address}: {source}; is \"terrafarm coordinator\" running there, \
-         and the port open?"
-    )]
-    Connect {
-        /// Where.
-        address: String,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// Somebody is there, but no coordinator that lets us in.
-    #[error("coordinator {address}: {source}")]
-    Handshake {
-        /// Where.
-        address: String,
-        /// What went wrong.
-        source: HandshakeError,
-    },
+    /// There is no coordinator, or it does not let us in.
+    #[error(transparent)]
+    Dial(#[from] DialError),
     /// The connection was lost.
     #[error("coordinator {address} was lost: {source}; what it had acknowledged stays")]
     Lost {
@@ -100,18 +83,8 @@ impl Line {
     /// # Errors
     /// If there is no coordinator, or it does not let us in.
     pub async fn open(address: &str, trust: &Trust) -> Result<Self, AskError> {
-        let unreachable = |source| AskError::Connect { address: address.into(), source };
-        let connecting = tokio::time::timeout(GREETING_LIMIT, TcpStream::connect(address));
-        let late = |_| unreachable(std::io::ErrorKind::TimedOut.into());
-        let stream = connecting.await.map_err(late)?.map_err(unreachable)?;
-        let _ = stream.set_nodelay(true);
-        let refused = |source| AskError::Handshake { address: address.into(), source };
-        let peer = stream.peer_addr().map_err(unreachable)?;
-        let token = trust.token_for(peer.ip()).map_err(refused)?;
-        let hello = Hello::new("desk", Role::Desk);
         let used = Instant::now();
-        let greeted = link::greet(stream, token, hello, GREETING_LIMIT).await;
-        let (connection, welcome) = greeted.map_err(refused)?;
+        let (connection, welcome) = dial(address, trust, "desk", Role::Desk).await?;
         let (address, trust) = (address.to_owned(), trust.clone());
         let silence = Duration::from_micros(welcome.silence_us);
         Ok(Line { address, trust, connection, silence, used, number: 0 })

@@ -3,6 +3,7 @@
 //! A coordinator that goes away is waited for: what has come is kept, what is missing is
 //! submitted again.
 
+use crate::dial::{DialError, GREETING_LIMIT, dial};
 use bytes::Bytes;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,17 +16,14 @@ use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Outbox, Trust, Unsent};
+use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox, Trust, Unsent};
 use terrafarm_wire::message::{
-    Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Hello, Message, NoBlob, Ping, Pong,
-    Progress, Role, ShotDone, Submit, WantBlobs, Welcome,
+    Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Message, NoBlob, Ping, Pong, Progress, Role,
+    ShotDone, Submit, WantBlobs,
 };
-use tokio::net::TcpStream;
 use tokio::sync::mpsc::{self, error::TrySendError};
 use tokio_util::sync::CancellationToken;
 
-/// How long connecting and greeting may take.
-const GREETING_LIMIT: Duration = Duration::from_secs(5);
 /// Messages that may wait for the coordinator on each lane.
 const URGENT_QUEUE: usize = 256;
 /// Blobs that may wait: a few megabytes.
@@ -96,25 +94,9 @@ pub struct FrameFacts {
 /// Why a shot did not come to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// Nobody answers.
-    #[error(
-        "cannot reach coordinator {address}: {source}; is \"terrafarm coordinator\" running there, \
-         and the port open?"
-    )]
-    Connect {
-        /// Where.
-        address: String,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// Somebody answers, but not as a coordinator.
-    #[error("coordinator {address}: {source}")]
-    Handshake {
-        /// Where.
-        address: String,
-        /// What went wrong.
-        source: HandshakeError,
-    },
+    /// There is no coordinator, or it does not let us in.
+    #[error(transparent)]
+    Dial(#[from] DialError),
     /// The connection was lost.
     #[error("the coordinator was lost: {0}; frames that have come are kept")]
     Link(#[from] LinkError),
@@ -203,8 +185,8 @@ impl ClientError {
     /// Whether the coordinator may take the shot when it is tried again.
     fn may_pass(&self) -> bool {
         match self {
-            ClientError::Connect { .. } | ClientError::Link(_) => true,
-            ClientError::Handshake { source, .. } => match source {
+            ClientError::Dial(DialError::Connect { .. }) | ClientError::Link(_) => true,
+            ClientError::Dial(DialError::Handshake { source, .. }) => match source {
                 HandshakeError::Refused { refusal, .. } | HandshakeError::TurnedAway(refusal) => {
                     refusal.is_temporary()
                 }
@@ -237,7 +219,7 @@ impl Errand {
         stop: &CancellationToken,
     ) -> Result<ShotDone, ClientError> {
         let (connection, welcome) = tokio::select! {
-            greeted = greet(coordinator, &self.submission.name) => greeted?,
+            greeted = dial(&coordinator.address, &coordinator.trust, &self.submission.name, Role::Client) => greeted?,
             () = stop.cancelled() => return Err(ClientError::Stopped),
         };
         let silence = Duration::from_micros(welcome.silence_us);
@@ -353,29 +335,6 @@ impl Errand {
             other => Some(other),
         }
     }
-}
-
-/// Connects, and greets over a link that is trusted.
-async fn greet(
-    coordinator: &Coordinator,
-    name: &str,
-) -> Result<(Connection<TcpStream>, Welcome), ClientError> {
-    let address = &coordinator.address;
-    let connect = tokio::time::timeout(GREETING_LIMIT, TcpStream::connect(address));
-    let stream = match connect.await {
-        Ok(Ok(stream)) => stream,
-        Ok(Err(source)) => return Err(ClientError::Connect { address: address.clone(), source }),
-        Err(_) => {
-            let source = std::io::Error::from(std::io::ErrorKind::TimedOut);
-            return Err(ClientError::Connect { address: address.clone(), source });
-        }
-    };
-    let _ = stream.set_nodelay(true);
-    let hello = Hello::new(name, Role::Client);
-    let refused = |source| ClientError::Handshake { address: address.clone(), source };
-    let peer = stream.peer_addr().map_err(|error| refused(LinkError::Io(error).into()))?;
-    let token = coordinator.trust.token_for(peer.ip()).map_err(refused)?;
-    link::greet(stream, token, hello, GREETING_LIMIT).await.map_err(refused)
 }
 
 /// What is known of the shot on this side.

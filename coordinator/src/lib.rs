@@ -10,6 +10,7 @@ pub mod api;
 pub mod ask;
 mod blobs;
 pub mod client;
+pub mod dial;
 mod driver;
 mod farm;
 #[doc(hidden)]

@@ -11,7 +11,10 @@ use terrafarm_common::id::BlobHash;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Shading, Sky};
-use terrafarm_wire::message::{Blob, Cameras, Failed, HandBack, RenderReport, Submit, WantBlobs};
+use terrafarm_terrain::store::hash_of;
+use terrafarm_wire::message::{
+    Blob, Cameras, Done, Failed, HandBack, RenderReport, Submit, Timesheet, WantBlobs,
+};
 use terrafarm_wire::pixels::Pixels;
 
 const SIZE: (u32, u32) = (64, 16);

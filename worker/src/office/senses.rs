@@ -7,7 +7,9 @@
 
 use super::Observation;
 use super::hours::WeekMinute;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+#[cfg(target_os = "linux")]
+use std::time::Instant;
 
 /// How often the session keeper is asked: it is a process of its own.
 #[cfg(target_os = "linux")]
