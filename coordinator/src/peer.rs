@@ -10,7 +10,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Meter, Trust, handshake};
+use terrafarm_wire::link::{
+    self, Connection, HandshakeError, Heard, LinkError, Meter, Trust, handshake,
+};
 use terrafarm_wire::message::{Message, Pong, Refusal, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
@@ -138,24 +140,26 @@ pub async fn serve(
     }
     // Workers are the scheduler's to watch, which probes them. A client pings by itself;
     // one that is silent for so long is gone, and its shots hold the farm for nobody.
-    let patience = admission.silence * CLIENT_PATIENCE;
+    let patience = (!is_worker).then_some(admission.silence * CLIENT_PATIENCE);
     let mut leaving = false;
     let how = loop {
         tokio::select! {
             () = hang_up.cancelled() => break Ok(()),
-            received = async {
-                if is_worker { reader.recv().await } else { reader.recv_within(patience).await }
-            } => match received {
-                Ok(Some(message)) => {
-                    leaving |= matches!(message, Message::Goodbye(_));
-                    let event = ToDriver::Event(peer, PeerEvent::Said(message));
-                    if admission.events.send(event).await.is_err() {
-                        break Ok(());
+            heard = reader.hear(patience) => {
+                let event = match heard {
+                    Ok(Heard::Message(message)) => {
+                        leaving |= matches!(message, Message::Goodbye(_));
+                        PeerEvent::Said(message)
                     }
+                    Ok(Heard::More) if is_worker => PeerEvent::Stirred,
+                    Ok(Heard::More) => continue,
+                    Ok(Heard::End) => break Ok(()),
+                    Err(why) => break Err(why),
+                };
+                if admission.events.send(ToDriver::Event(peer, event)).await.is_err() {
+                    break Ok(());
                 }
-                Ok(None) => break Ok(()),
-                Err(why) => break Err(why),
-            },
+            }
         }
     };
     let (reason, text) = match how {
