@@ -187,6 +187,28 @@ fn what_a_lost_worker_held_is_rendered_by_another_and_its_late_result_is_refused
 }
 
 #[test]
+fn a_worker_whose_long_message_comes_slowly_is_not_dropped_from_a_live_shot() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    bench.join(worker(2), 1);
+    bench.join(Peer::Client(CLIENT), 0);
+    bench.say(Peer::Client(CLIENT), Submit { live: true, ..submission(1) });
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
+    bench.say(Peer::Client(CLIENT), Cameras { number: 1, first: 0, cameras: vec![camera] });
+    let mut closed = Vec::new();
+    for _ in 0..25 {
+        bench.now = bench.now.after(39_000);
+        for one in bench.event(worker(1), PeerEvent::Stirred) {
+            if let Out::Close(peer, why) = one {
+                closed.push((peer, why));
+            }
+        }
+    }
+    assert_eq!(closed.len(), 1, "{closed:?}");
+    assert_eq!(closed[0].0, worker(2), "it said nothing");
+}
+
+#[test]
 fn pixels_of_the_wrong_number_fail_the_job_and_not_the_farm() {
     let mut bench = Bench::new();
     bench.join(worker(1), 1);
