@@ -12,7 +12,7 @@ use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_coordinator::ask::Line;
 use terrafarm_coordinator::queue::{ShotPlan, Source};
 use terrafarm_terrain::store::StoreReader;
@@ -465,14 +465,7 @@ fn tiny(store: &StoreReader, number: u32) -> ShotPlan {
         name: format!("shot number {number}"),
         priority: 0,
         index: store.index_blob().0,
-        shading: Shading {
-            sun: None,
-            haze: None,
-            sky: Sky::default(),
-            earth: None,
-            below_ground: [0.0; 3],
-            bare_ground: None,
-        },
+        shading: Shading::default(),
         quality: Quality { method: Method::Auto, samples_per_side: 1, tolerance_px: 1.0 },
         check: Share::NONE,
         size: [size.0, size.1],

@@ -15,9 +15,9 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::WorkerId;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::Message;
 use terrafarm_wire::message::{Done, Grant, RenderReport, Timesheet, WantBlobs};
@@ -187,14 +187,7 @@ pub fn plan(land: &Land, frames: u32) -> ShotPlan {
         name: "hills".into(),
         priority: 0,
         index: land.index,
-        shading: Shading {
-            sun: None,
-            haze: None,
-            sky: Sky::default(),
-            earth: None,
-            below_ground: [0.0; 3],
-            bare_ground: None,
-        },
+        shading: Shading::default(),
         quality: Quality::default(),
         check: Share::NONE,
         size: [SIZE.0, SIZE.1],
@@ -217,17 +210,8 @@ pub struct Land {
 struct Slope;
 
 impl LayerSource for Slope {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        for (at, post) in into.iter_mut().enumerate() {
-            *post = (i0 as usize + at % width + 3 * (j0 as usize + at / width)) as f32;
-        }
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        window.fill(into, |i, j| (i + 3 * j) as f32);
         Ok(())
     }
 }
