@@ -17,8 +17,8 @@
 //! a crash costs the frame: it is rendered again and written over.
 //!
 //! [`Queue`] is the handle; [`QueueTask`] does the work. Within: `plan` is what is
-//! submitted, `book` decides (pure), `ledger` keeps records, `blobs` terrain, `pictures`
-//! frames and films, `task` joins them.
+//! submitted, `book` decides (pure), `ledger` keeps records (`record`), `blobs` terrain,
+//! `pictures` frames and films, `task` joins them.
 
 mod blobs;
 mod book;
@@ -26,6 +26,7 @@ mod disk;
 mod ledger;
 mod pictures;
 mod plan;
+mod record;
 mod task;
 
 pub use plan::{Film, PIXELS_IN_FLIGHT_MAX, ShotPlan, Source, TEXT_BYTES_MAX, parse_hash};

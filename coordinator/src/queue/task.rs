@@ -333,8 +333,13 @@ impl Task {
         let last = first + frames.saturating_sub(1);
         let index = index.ok_or(QueueError::NoFrame { shot: id, first, last, frame })?;
         match self.ledger(move |ledger| ledger.frame(id, index)).await? {
-            Some(FrameRecord::Done { .. }) => return Ok("it is done".into()),
-            Some(FrameRecord::Failed(reason)) => return Ok(format!("it failed: {reason}")),
+            Some(Some(FrameRecord::Done { .. })) => return Ok("it is done".into()),
+            Some(Some(FrameRecord::Failed(reason))) => return Ok(format!("it failed: {reason}")),
+            Some(None) => {
+                return Ok(
+                    "its record is damaged: it is rendered again when the rest is done".into()
+                );
+            }
             None => {}
         }
         let view = self.view(id).ok_or(QueueError::NoShot(id))?;

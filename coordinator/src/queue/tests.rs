@@ -2,6 +2,7 @@
 //! of being cut off.
 #![allow(clippy::unwrap_used)]
 
+mod damaged;
 mod full;
 pub(crate) mod house;
 mod killed;

@@ -8,7 +8,7 @@ use std::time::Instant;
 use terrafarm_common::id::ShotId;
 use tokio_util::sync::CancellationToken;
 
-/// How often pictures of a shot may be found damaged before it is given up.
+/// How often pictures or records of a shot may be found damaged before it is given up.
 const LOSSES_MAX: u32 = 3;
 
 impl Task {
@@ -111,8 +111,15 @@ impl Task {
         let (shared, tell) = (self.shared.clone(), self.tell.clone());
         self.errands.spawn(async move {
             let work = tokio::task::spawn_blocking(move || {
-                let frames =
+                let kept =
                     shared.with_ledger(|ledger| ledger.frames(shot)).map_err(Unfinished::Disk)?;
+                let damaged = kept.iter().filter(|(_, frame)| frame.is_none());
+                let damaged: Vec<_> = damaged.map(|(index, _)| *index).collect();
+                if !damaged.is_empty() {
+                    return Err(Unfinished::Lost(damaged));
+                }
+                let whole = kept.into_iter().filter_map(|(index, frame)| Some((index, frame?)));
+                let frames = whole.collect();
                 pictures::finish(&shared.config.folder, &files, &record, &frames, &stop)
             });
             let result = work.await.unwrap_or(Ok("there is no film: its encoder failed".into()));
@@ -140,7 +147,7 @@ impl Task {
                 let losses = self.losses.entry(shot).or_default();
                 *losses += 1;
                 if *losses > LOSSES_MAX {
-                    let why = "its pictures were found damaged on the disk again and again";
+                    let why = "its pictures or their records were found damaged on the disk again and again";
                     return self.fail(shot, why.into()).await;
                 }
                 let count = frames.len();

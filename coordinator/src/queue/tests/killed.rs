@@ -28,7 +28,7 @@ fn recorded(folder: &Path) -> BTreeSet<(ShotId, FrameIndex)> {
     let mut all = BTreeSet::new();
     for shot in saved {
         for (index, record) in ledger.frames(shot.id).unwrap() {
-            let FrameRecord::Done { bytes, .. } = record else { panic!("{record:?}") };
+            let Some(FrameRecord::Done { bytes, .. }) = record else { panic!("{record:?}") };
             let path = picture(&shot_folder(folder, shot.id), index);
             assert_eq!(fs::metadata(path).unwrap().len(), bytes, "a record without its picture");
             all.insert((shot.id, index));
