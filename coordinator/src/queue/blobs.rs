@@ -1,8 +1,10 @@
 //! Terrain of the queue: one file a blob, named by its hash.
 //!
 //! A blob is checked when it comes and each time it is read: a damaged one is removed, so
-//! that it counts as missing and is sent again. Blobs are synced when a shot that needs
-//! them is taken, not one by one.
+//! that it counts as missing and is sent again. One that the disk does not read, and all
+//! blobs of a store of which one was damaged, are suspect: they count as here when they have
+//! been read from end to end, and what is sent takes their place. Blobs are synced when a shot
+//! that needs them is taken, not one by one.
 
 use super::{QueueConfig, QueueError, disk};
 use bytes::Bytes;
@@ -17,6 +19,9 @@ use terrafarm_common::id::BlobHash;
 use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::limits::BLOB_BYTES_MAX;
 
+/// Most blobs that are suspect at once; of more, each shows when it is read.
+const SUSPECTS_MAX: usize = 1 << 20;
+
 /// The terrain of the queue.
 #[derive(Debug)]
 pub struct Blobs {
@@ -24,6 +29,8 @@ pub struct Blobs {
     folder: PathBuf,
     /// Those that came and are not yet known to be on the disk.
     unsynced: Mutex<HashSet<BlobHash>>,
+    /// Those that are believed when they have been read.
+    suspects: Mutex<HashSet<BlobHash>>,
     count: AtomicU64,
 }
 
@@ -34,6 +41,7 @@ impl Blobs {
             config: config.clone(),
             folder: config.folder.join("blobs"),
             unsynced: Mutex::default(),
+            suspects: Mutex::default(),
             count: AtomicU64::new(0),
         }
     }
@@ -64,7 +72,8 @@ impl Blobs {
         disk::has_room(&self.config.folder, self.config.reserve_bytes, 0)
     }
 
-    /// Those that are not here; the others stay for the time of grace from now on.
+    /// Those that are not here; the others stay for the time of grace from now on. Reads
+    /// those that are suspect.
     pub fn missing(&self, hashes: Vec<BlobHash>) -> Vec<BlobHash> {
         let now = SystemTime::now();
         hashes.into_iter().filter(|&hash| !self.touch(hash, now)).collect()
@@ -72,6 +81,9 @@ impl Blobs {
 
     /// Marks a blob as used now; returns whether it is here.
     fn touch(&self, hash: BlobHash, now: SystemTime) -> bool {
+        if self.suspects().contains(&hash) && !matches!(self.read(hash), Ok(Some(_))) {
+            return false;
+        }
         let file = File::options().append(true).open(self.path(hash));
         // One that cannot be marked is here all the same.
         file.map(|file| file.set_modified(now)).is_ok()
@@ -105,6 +117,7 @@ impl Blobs {
             let _ = fs::remove_file(&beside);
             return Err(self.error("write", &self.path(hash), &why));
         }
+        self.suspects().remove(&hash);
         self.unsynced().insert(hash);
         Ok(())
     }
@@ -112,8 +125,34 @@ impl Blobs {
     /// A blob; `None` if it is not here, or was damaged and is no longer.
     ///
     /// # Errors
-    /// If the disk cannot read it.
+    /// If the disk cannot read it: then it is suspect.
     pub fn read(&self, hash: BlobHash) -> Result<Option<Bytes>, QueueError> {
+        let read = self.read_through(hash);
+        match &read {
+            Ok(_) => drop(self.suspects().remove(&hash)),
+            Err(_) => self.suspect([hash]),
+        }
+        read
+    }
+
+    fn suspect(&self, hashes: impl IntoIterator<Item = BlobHash>) {
+        let mut suspects = self.suspects();
+        let room = SUSPECTS_MAX.saturating_sub(suspects.len());
+        suspects.extend(hashes.into_iter().take(room));
+    }
+
+    /// A blob of this store was damaged: so may be others of the same disk. Whoever sends the
+    /// terrain again is to be asked for all of them at once.
+    ///
+    /// # Errors
+    /// If its index cannot be read: that comes first then.
+    pub fn suspect_store(&self, index: BlobHash) -> Result<(), QueueError> {
+        let all = self.store(index)?;
+        self.suspect(all.into_iter().map(|(hash, _)| hash));
+        Ok(())
+    }
+
+    fn read_through(&self, hash: BlobHash) -> Result<Option<Bytes>, QueueError> {
         let path = self.path(hash);
         let wrong = |why: &io::Error| self.error("read", &path, why);
         let file = match File::open(&path) {
@@ -224,6 +263,10 @@ impl Blobs {
             removed += bytes;
         }
         Ok(removed)
+    }
+
+    fn suspects(&self) -> std::sync::MutexGuard<'_, HashSet<BlobHash>> {
+        self.suspects.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn unsynced(&self) -> std::sync::MutexGuard<'_, HashSet<BlobHash>> {

@@ -219,7 +219,7 @@ impl Task {
             }
             News::Lacks(stay, hash) => {
                 // It may have come since.
-                let is_here = self.shared.blobs.missing(vec![hash]).is_empty();
+                let is_here = self.is_here(hash).await;
                 self.lacks(stay, hash, !is_here).await;
             }
             News::Unread(stay, hash) => self.lacks(stay, hash, true).await,
@@ -371,6 +371,13 @@ impl Task {
     ) -> Result<T, QueueError> {
         let shared = self.shared.clone();
         blocking(move || shared.with_ledger(work)).await
+    }
+
+    /// Whether a blob of terrain can be had.
+    async fn is_here(&self, hash: BlobHash) -> bool {
+        let blobs = self.shared.blobs.clone();
+        let missing = blocking(move || Ok(blobs.missing(vec![hash]))).await;
+        missing.is_ok_and(|missing| missing.is_empty())
     }
 
     fn files(&self, id: ShotId, record: &ShotRecord) -> ShotFiles {

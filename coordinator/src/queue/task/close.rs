@@ -196,7 +196,7 @@ impl Task {
             self.book.set_refused(shot, None);
         }
         for (shot, hash) in self.book.all_lacking() {
-            if self.shared.blobs.missing(vec![hash]).is_empty() {
+            if self.is_here(hash).await {
                 self.book.set_lacks(shot, None);
                 self.sync_pause(shot).await;
                 self.changed.insert(shot);

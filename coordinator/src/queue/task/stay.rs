@@ -278,6 +278,14 @@ impl Task {
     /// had again, unless it is here by now.
     pub async fn lacks(&mut self, id: StayId, hash: BlobHash, waits: bool) {
         let Some(shot) = self.stays.get(&id).map(|stay| stay.shot) else { return };
+        let index = self.book.get(shot).map(|state| state.record.plan.index);
+        if let (Some(index), true) = (index, waits) {
+            tracing::warn!(%shot, %hash, "terrain is damaged or gone; the shot waits for it");
+            let blobs = self.shared.blobs.clone();
+            if let Err(why) = blocking(move || blobs.suspect_store(index)).await {
+                tracing::warn!(%shot, "its terrain cannot be looked through: {why}");
+            }
+        }
         self.book.set_lacks(shot, waits.then_some(hash));
         // First its jobs are stopped, else they would fail.
         self.sync_pause(shot).await;

@@ -1,5 +1,5 @@
 //! Records that are damaged one by one, in a database that is whole: each costs its own shot
-//! or frame.
+//! or frame. And terrain that is damaged: it is asked for again, all of it at once.
 
 use super::house::{House, Land, plan, until};
 use super::*;
@@ -107,4 +107,44 @@ async fn a_frame_whose_record_is_damaged_is_rendered_again_and_holds_up_nobody()
         assert_eq!(manifest(&files).frames.len(), 4);
         assert_eq!(house.queue.shot(ShotId(shot)).unwrap().frames_done, 4);
     }
+}
+
+fn blob_path(folder: &Path, hash: BlobHash) -> PathBuf {
+    let name = hash.to_hex();
+    folder.join("blobs").join(&name[..2]).join(name)
+}
+
+/// What the disk cannot read and what is not what it should be is asked for, and what is sent
+/// takes its place: one question and one answer are enough, whatever was damaged.
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn terrain_that_is_damaged_in_every_way_is_mended_by_sending_it_once_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let tiles: Vec<_> = land.blobs[1..].iter().map(|(hash, _)| *hash).collect();
+    assert!(tiles.len() > 2, "{}", tiles.len());
+    house.queue.submit(plan(&land, 3)).await.unwrap();
+    let all: Vec<_> = land.blobs.iter().map(|(hash, _)| *hash).collect();
+    assert_eq!(house.queue.missing_blobs(all.clone()).await.unwrap(), []);
+    // Of the right length with other bytes, cut off, and one that can be opened and not read.
+    let mut bytes = fs::read(blob_path(folder.path(), tiles[0])).unwrap();
+    bytes[0] ^= 1;
+    fs::write(blob_path(folder.path(), tiles[0]), &bytes).unwrap();
+    fs::write(blob_path(folder.path(), tiles[1]), &bytes[..3]).unwrap();
+    fs::remove_file(blob_path(folder.path(), tiles[2])).unwrap();
+    std::os::unix::fs::symlink("/proc/self/mem", blob_path(folder.path(), tiles[2])).unwrap();
+    let _worker = house.hire(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].state == ShotState::Stalled).await;
+    let note = house.queue.shots()[0].note.clone();
+    assert!(note.contains("submit the terrain again"), "{note}");
+    let missing = house.queue.missing_blobs(all).await.unwrap();
+    assert_eq!(missing, tiles[..3]);
+    for (hash, bytes) in land.blobs.iter().filter(|(hash, _)| missing.contains(hash)) {
+        house.queue.put_blob(*hash, bytes.clone()).await.unwrap();
+    }
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    assert_eq!(house.queue.shots()[0].frames_failed, 0);
+    assert!(fs::symlink_metadata(blob_path(folder.path(), tiles[2])).unwrap().is_file());
 }
