@@ -41,6 +41,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use task::Task;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
+use terrafarm_terrain::store::hash_of;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -55,6 +56,11 @@ pub const OVER_MAX: usize = 20_000;
 pub const MISSING_MAX: usize = 1 << 16;
 /// Commands that may wait for the task; further ones wait with whoever gives them.
 const COMMANDS: usize = 256;
+
+/// Longest key of a submission, bytes.
+pub const KEY_BYTES_MAX: usize = 128;
+/// How long keys of submissions are remembered, at least.
+pub const KEY_KEPT: Duration = Duration::from_secs(2 * 24 * 3600);
 
 /// Every shot of the queue, by number.
 pub type ShotList = Arc<Vec<Arc<ShotView>>>;
@@ -152,6 +158,17 @@ pub enum QueueError {
         /// What it is.
         found: BlobHash,
     },
+    /// What was submitted under a key before is something else.
+    #[error(
+        "the key {key:?} was used for {shot}, which is another submission; use a new key for each shot, \
+         and the same one only to send the same again"
+    )]
+    KeyReused {
+        /// The key.
+        key: String,
+        /// What it stands for.
+        shot: ShotId,
+    },
     /// None of the queue's shots.
     #[error("there is no {0} in the queue; \"terrafarm shots\" lists those that are")]
     NoShot(ShotId),
@@ -188,6 +205,29 @@ pub enum QueueError {
 
 fn owner(pid: Option<u32>) -> String {
     pid.map_or("another coordinator".into(), |pid| format!("the coordinator with process {pid}"))
+}
+
+/// What makes a submission that is sent again the same one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SubmissionKey {
+    key: String,
+    /// SHA-256 of what was submitted.
+    content: BlobHash,
+}
+
+impl SubmissionKey {
+    /// The key of a submission with this content; drawn at random by whoever submits.
+    ///
+    /// # Errors
+    /// [`QueueError::Unfit`] unless it has 1 to [`KEY_BYTES_MAX`] visible ASCII characters.
+    pub fn new(key: &str, content: &[u8]) -> Result<Self, QueueError> {
+        let visible = key.bytes().all(|symbol| symbol.is_ascii_graphic());
+        if key.is_empty() || key.len() > KEY_BYTES_MAX || !visible {
+            let why = format!("its key has to have 1 to {KEY_BYTES_MAX} visible ASCII characters");
+            return Err(QueueError::Unfit(why));
+        }
+        Ok(SubmissionKey { key: key.to_owned(), content: hash_of(content) })
+    }
 }
 
 /// Where the files of a shot are, or will be.
@@ -239,7 +279,9 @@ pub struct Queue {
 
 /// What the task is told by handles.
 enum Command {
-    Submit(Box<ShotPlan>, oneshot::Sender<Result<ShotId, QueueError>>),
+    Submit(Box<ShotPlan>, Option<SubmissionKey>, oneshot::Sender<Result<ShotId, QueueError>>),
+    /// The shot of a submission that may have come before.
+    Recall(SubmissionKey, oneshot::Sender<Result<Option<ShotId>, QueueError>>),
     Order(Order, oneshot::Sender<Result<String, QueueError>>),
     /// A blob came that may have been missed.
     Came(BlobHash),
@@ -304,6 +346,28 @@ impl Queue {
     /// # Errors
     /// If it cannot be rendered, some of its terrain is not here, or there is no room.
     pub async fn submit(&self, plan: ShotPlan) -> Result<ShotId, QueueError> {
+        self.take(plan, None).await
+    }
+
+    /// As [`Queue::submit`], once for each key: who is not sure whether a submission has come
+    /// sends it again with its key, and gets the number of the shot that it was. Keys are
+    /// remembered for [`KEY_KEPT`] at least, restarts included.
+    ///
+    /// # Errors
+    /// As [`Queue::submit`], and [`QueueError::KeyReused`].
+    pub async fn submit_once(
+        &self,
+        plan: ShotPlan,
+        key: SubmissionKey,
+    ) -> Result<ShotId, QueueError> {
+        // First, since terrain and room may be gone that the shot had when it was taken.
+        match self.ask(|answer| Command::Recall(key.clone(), answer)).await? {
+            Some(shot) => Ok(shot),
+            None => self.take(plan, Some(key)).await,
+        }
+    }
+
+    async fn take(&self, plan: ShotPlan, key: Option<SubmissionKey>) -> Result<ShotId, QueueError> {
         let blobs = self.blobs.clone();
         let plan = blocking(move || {
             plan.check()?;
@@ -312,7 +376,7 @@ impl Queue {
             Ok(plan)
         });
         let plan = Box::new(plan.await?);
-        self.ask(|answer| Command::Submit(plan, answer)).await
+        self.ask(|answer| Command::Submit(plan, key, answer)).await
     }
 
     /// Carries out an order about a shot of the queue: pause, resume, cancel, priority,

@@ -91,6 +91,7 @@ impl From<QueueError> for Refusal {
             QueueError::NoShot(_) | QueueError::NoFrame { .. } => StatusCode::NOT_FOUND,
             QueueError::Unfit(_) | QueueError::WrongBlob { .. } => StatusCode::BAD_REQUEST,
             QueueError::TooMany(_) => StatusCode::PAYLOAD_TOO_LARGE,
+            QueueError::KeyReused { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             QueueError::Over { .. } => StatusCode::CONFLICT,
             QueueError::Full | QueueError::DiskFull { .. } => StatusCode::INSUFFICIENT_STORAGE,
             QueueError::Stopping => StatusCode::SERVICE_UNAVAILABLE,

@@ -4,17 +4,21 @@ use super::board::{Board, Page, Window};
 use super::refusal::Refusal;
 use super::{BULKY_AT_ONCE, Desk};
 use crate::order::Order;
-use crate::queue::{ShotPlan, parse_hash};
+use crate::queue::{ShotPlan, SubmissionKey, parse_hash};
 use crate::view::ShotView;
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::{Path, Query, Request, State};
+use axum::http::HeaderMap;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::sync::Arc;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId, WorkerId};
+
+/// Says that a submission is the same one when it is sent again.
+const KEY_HEADER: &str = "idempotency-key";
 
 /// Answers of handlers.
 pub(super) type Answer = Result<Json<Value>, Refusal>;
@@ -57,14 +61,50 @@ pub(super) async fn one(State(desk): State<Arc<Desk>>, Path(shot): Path<String>)
     Ok(Json(json!(shot.as_ref())))
 }
 
+/// A key in the address, where there are no headers.
+#[derive(Deserialize)]
+pub(super) struct Keyed {
+    idempotency_key: Option<String>,
+}
+
+impl Keyed {
+    /// The key of a submission, by header or by address.
+    fn key(self, headers: &HeaderMap) -> Result<Option<String>, Refusal> {
+        let Some(header) = headers.get(KEY_HEADER) else { return Ok(self.idempotency_key) };
+        let text = header.to_str().map_err(|_| Refusal::malformed("the Idempotency-Key is odd"))?;
+        // Some write it as a string of structured headers.
+        let bare = text.strip_prefix('"').and_then(|text| text.strip_suffix('"'));
+        let key = bare.unwrap_or(text).to_owned();
+        match self.idempotency_key {
+            Some(other) if other != key => {
+                Err(Refusal::malformed("the header and the address have different keys"))
+            }
+            _ => Ok(Some(key)),
+        }
+    }
+}
+
 /// `POST /api/v1/shots`
-pub(super) async fn submit(State(desk): State<Arc<Desk>>, body: Bytes) -> Answer {
+pub(super) async fn submit(
+    State(desk): State<Arc<Desk>>,
+    Query(keyed): Query<Keyed>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Answer {
     let queue = desk.queue()?;
+    let key = keyed.key(&headers)?;
     // A million cameras take a second to read: not on a thread that others wait for.
-    let read = tokio::task::spawn_blocking(move || serde_json::from_slice::<ShotPlan>(&body));
-    let plan = read.await.map_err(|_| Refusal::malformed("the shot cannot be read"))?;
-    let plan = plan.map_err(|why| Refusal::malformed(format!("this is no shot: {why}")))?;
-    let shot = queue.submit(plan).await?;
+    let read = tokio::task::spawn_blocking(move || {
+        let key = key.map(|key| SubmissionKey::new(&key, &body)).transpose()?;
+        let plan = serde_json::from_slice::<ShotPlan>(&body);
+        let plan = plan.map_err(|why| Refusal::malformed(format!("this is no shot: {why}")))?;
+        Ok::<_, Refusal>((plan, key))
+    });
+    let read = read.await.map_err(|_| Refusal::malformed("the shot cannot be read"))?;
+    let shot = match read? {
+        (plan, Some(key)) => queue.submit_once(plan, key).await?,
+        (plan, None) => queue.submit(plan).await?,
+    };
     Ok(Json(json!({ "shot": shot })))
 }
 

@@ -11,8 +11,9 @@
 //! | `cameras` | shot, piece | up to 1024 cameras of 13 f64 each, little endian |
 //! | `frames` | shot, index | [`FrameRecord`], JSON |
 //! | `progress` | shot | frames done, frames failed, last one done + 1 |
+//! | `keys` | key of a submission | shot, seconds since 1970, SHA-256 of the submission |
 
-use super::QueueError;
+use super::{QueueError, SubmissionKey};
 use redb::{Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTransaction};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -20,7 +21,7 @@ use std::io::ErrorKind;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use terrafarm_common::camera::Camera;
-use terrafarm_common::id::{FrameIndex, ShotId};
+use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 
 /// The format that this program reads and writes.
 const VERSION: u64 = 1;
@@ -38,6 +39,10 @@ const SHOTS: TableDefinition<u64, &[u8]> = TableDefinition::new("shots");
 const CAMERAS: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("cameras");
 const FRAMES: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("frames");
 const PROGRESS: TableDefinition<u64, (u32, u32, u32)> = TableDefinition::new("progress");
+
+/// Shot, seconds since 1970, hash of what was submitted.
+type KeyRow = (u64, u64, [u8; 32]);
+const KEYS: TableDefinition<&str, KeyRow> = TableDefinition::new("keys");
 
 /// Opens the file; again and again, if need be.
 type Opener = Box<dyn Fn() -> Result<Database, redb::DatabaseError> + Send>;
@@ -69,6 +74,7 @@ impl Ledger {
             transaction.open_table(CAMERAS)?;
             transaction.open_table(FRAMES)?;
             transaction.open_table(PROGRESS)?;
+            transaction.open_table(KEYS)?;
             let mut meta = transaction.open_table(META)?;
             let version = meta.get("version")?.map(|version| version.value());
             if version.is_none() {
@@ -104,7 +110,7 @@ impl Ledger {
         })
     }
 
-    /// Adds a shot and its cameras.
+    /// Adds a shot and its cameras, and the key under which it was submitted, if it had one.
     ///
     /// # Errors
     /// If it cannot be written; then nothing is.
@@ -113,16 +119,60 @@ impl Ledger {
         id: ShotId,
         record: &ShotRecord,
         cameras: &[Camera],
+        key: Option<&SubmissionKey>,
     ) -> Result<(), QueueError> {
+        let submitted_s = record.submitted_s;
         let record = self.text(record)?;
         self.write(|transaction| {
             transaction.open_table(META)?.insert("last", id.0)?;
+            if let Some(SubmissionKey { key, content }) = key {
+                let row = (id.0, submitted_s, content.0);
+                transaction.open_table(KEYS)?.insert(key.as_str(), row)?;
+            }
             transaction.open_table(SHOTS)?.insert(id.0, record.as_slice())?;
             let mut table = transaction.open_table(CAMERAS)?;
             for (piece, cameras) in (0..).zip(cameras.chunks(PIECE)) {
                 table.insert((id.0, piece), pack(cameras).as_slice())?;
             }
             Ok(())
+        })
+    }
+
+    /// The shot that was submitted under a key, and the hash of what was submitted.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn recall(&mut self, key: &str) -> Result<Option<(ShotId, BlobHash)>, QueueError> {
+        self.read(|transaction| {
+            let row = transaction.open_table(KEYS)?.get(key)?.map(|row| row.value());
+            Ok(row.map(|(shot, _, content)| (ShotId(shot), BlobHash(content))))
+        })
+    }
+
+    /// Forgets keys that are older than this many seconds since 1970; returns how many.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn forget_keys(&mut self, before_s: u64) -> Result<usize, QueueError> {
+        let old = self.read(|transaction| {
+            let mut old = Vec::new();
+            for row in transaction.open_table(KEYS)?.iter()? {
+                let (key, row) = row?;
+                if row.value().1 < before_s {
+                    old.push(key.value().to_owned());
+                }
+            }
+            Ok(old)
+        })?;
+        if old.is_empty() {
+            return Ok(0);
+        }
+        self.write(|transaction| {
+            let mut keys = transaction.open_table(KEYS)?;
+            for key in &old {
+                keys.remove(key.as_str())?;
+            }
+            Ok(old.len())
         })
     }
 

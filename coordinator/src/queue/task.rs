@@ -16,8 +16,8 @@ use super::disk::{self, FolderLock};
 use super::ledger::{FrameRecord, Ledger, Progress, Saved, ShotRecord, Stage};
 use super::pictures::Unfinished;
 use super::{
-    Command, QueueConfig, QueueError, SHOTS_MAX, ShotFiles, ShotList, ShotPlan, blocking,
-    shot_folder,
+    Command, QueueConfig, QueueError, SHOTS_MAX, ShotFiles, ShotList, ShotPlan, SubmissionKey,
+    blocking, shot_folder,
 };
 use crate::driver::FarmLine;
 use crate::order::{Order, OrderError};
@@ -238,8 +238,11 @@ impl Task {
 
     async fn obey(&mut self, command: Command) {
         match command {
-            Command::Submit(plan, answer) => {
-                let submitted = self.submit(*plan).await;
+            Command::Recall(key, answer) => {
+                let _ = answer.send(self.recall(&key).await);
+            }
+            Command::Submit(plan, key, answer) => {
+                let submitted = self.submit(*plan, key).await;
                 self.publish();
                 // Who asked may have gone; the shot is there all the same.
                 let _ = answer.send(submitted);
@@ -260,7 +263,27 @@ impl Task {
         }
     }
 
-    async fn submit(&mut self, mut plan: ShotPlan) -> Result<ShotId, QueueError> {
+    /// The shot that was submitted with this key, if there was one.
+    async fn recall(&self, key: &SubmissionKey) -> Result<Option<ShotId>, QueueError> {
+        let SubmissionKey { key, content } = key.clone();
+        let text = key.clone();
+        match self.ledger(move |ledger| ledger.recall(&text)).await? {
+            Some((shot, before)) if before != content => Err(QueueError::KeyReused { key, shot }),
+            known => Ok(known.map(|(shot, _)| shot)),
+        }
+    }
+
+    async fn submit(
+        &mut self,
+        mut plan: ShotPlan,
+        key: Option<SubmissionKey>,
+    ) -> Result<ShotId, QueueError> {
+        // It may have come twice at the same time.
+        if let Some(key) = &key
+            && let Some(shot) = self.recall(key).await?
+        {
+            return Ok(shot);
+        }
         if self.book.unfinished() >= SHOTS_MAX {
             return Err(QueueError::Full);
         }
@@ -275,7 +298,7 @@ impl Task {
         };
         let id = ShotId(self.farm.last_shot().fetch_add(1, Ordering::Relaxed) + 1);
         let kept = record.clone();
-        self.ledger(move |ledger| ledger.add(id, &kept, &cameras)).await?;
+        self.ledger(move |ledger| ledger.add(id, &kept, &cameras, key.as_ref())).await?;
         tracing::info!(shot = %id, name = %record.plan.name, frames = record.frames, "queued");
         self.book.add(Saved { id, record, progress: Progress::default() });
         self.changed.insert(id);

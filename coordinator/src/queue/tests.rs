@@ -105,6 +105,61 @@ async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
     assert_eq!(house.queue.shot(shot).unwrap().frames_failed, 0);
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_submission_that_is_sent_again_with_its_key_is_the_shot_that_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let key = |key: &str, content: &[u8]| SubmissionKey::new(key, content).unwrap();
+    let (first, second) = (key("k-1", b"hills"), key("k-2", b"hills"));
+    let (one, other) = tokio::join!(
+        house.queue.submit_once(plan(&land, 2), first.clone()),
+        house.queue.submit_once(plan(&land, 2), first.clone()),
+    );
+    assert_eq!((one.unwrap(), other.unwrap()), (ShotId(1), ShotId(1)), "at the same time");
+    assert_eq!(house.queue.submit_once(plan(&land, 2), second).await.unwrap(), ShotId(2));
+    house.queue.order(Order::Cancel(ShotId(1))).await.unwrap();
+    for (hash, _) in &land.blobs {
+        fs::remove_file(folder.path().join("blobs").join(&hash.to_hex()[..2]).join(hash.to_hex()))
+            .unwrap();
+    }
+    for _ in 0..2 {
+        // Over by now, and without its terrain: it was taken all the same.
+        assert_eq!(
+            house.queue.submit_once(plan(&land, 2), first.clone()).await.unwrap(),
+            ShotId(1)
+        );
+        let reused = house.queue.submit_once(plan(&land, 2), key("k-1", b"valley")).await;
+        let shot = ShotId(1);
+        assert!(matches!(reused, Err(QueueError::KeyReused { shot: of, .. }) if of == shot));
+        house = house.restart().await;
+    }
+    assert_eq!(house.queue.shots().len(), 2);
+    for bad in ["", "a b", "\u{fc}", &"x".repeat(KEY_BYTES_MAX + 1)] {
+        assert!(SubmissionKey::new(bad, b"").is_err(), "{bad:?}");
+    }
+}
+
+#[test]
+fn keys_of_submissions_are_forgotten_when_they_are_old_and_not_before() {
+    use ledger::{Ledger, ShotRecord, Stage};
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
+    for (number, submitted_s) in [(1, 100), (2, 200), (3, 300)] {
+        let (plan, note, workers) = (plan(&land, 1), String::new(), Vec::new());
+        let (frames, stage) = (1, Stage::Open);
+        let record = ShotRecord { plan, frames, submitted_s, stage, note, workers };
+        let key = SubmissionKey::new(&format!("k-{number}"), b"").unwrap();
+        ledger.add(ShotId(number), &record, &[], Some(&key)).unwrap();
+    }
+    assert_eq!(ledger.forget_keys(100).unwrap(), 0);
+    assert_eq!(ledger.forget_keys(201).unwrap(), 2);
+    assert_eq!(ledger.recall("k-2").unwrap(), None);
+    assert_eq!(ledger.recall("k-3").unwrap().unwrap().0, ShotId(3));
+}
+
 #[cfg(target_os = "linux")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn terrain_that_the_disk_does_not_read_is_waited_for_and_fails_no_frame() {

@@ -3,8 +3,8 @@
 use super::{News, SWEEP, Task};
 use crate::queue::ledger::{ShotRecord, Stage};
 use crate::queue::pictures::{self, Unfinished};
-use crate::queue::{OVER_MAX, QueueError, disk};
-use std::time::Instant;
+use crate::queue::{KEY_KEPT, OVER_MAX, QueueError, disk};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::ShotId;
 use tokio_util::sync::CancellationToken;
 
@@ -246,7 +246,7 @@ impl Task {
         }
     }
 
-    /// Looks through the terrain, when it is time.
+    /// Looks through terrain and keys for what is old, when it is time.
     pub fn sweep(&mut self) {
         let is_due = self.swept.is_none_or(|last| last.elapsed() >= SWEEP);
         if self.is_sweeping || !is_due {
@@ -255,7 +255,13 @@ impl Task {
         (self.is_sweeping, self.swept) = (true, Some(Instant::now()));
         let (shared, tell, terrain) = (self.shared.clone(), self.tell.clone(), self.book.terrain());
         self.errands.spawn(async move {
-            let swept = crate::queue::blocking(move || shared.blobs.sweep(&terrain)).await;
+            let swept = crate::queue::blocking(move || {
+                let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+                let before = now.saturating_sub(KEY_KEPT).as_secs();
+                shared.with_ledger(|ledger| ledger.forget_keys(before))?;
+                shared.blobs.sweep(&terrain)
+            });
+            let swept = swept.await;
             let _ = tell.send(News::Swept(swept)).await;
         });
     }

@@ -55,7 +55,7 @@ async fn a_film_that_is_being_made_does_not_hold_up_the_end() {
         workers: Vec::new(),
     };
     let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
-    ledger.add(shot, &record, &[]).unwrap();
+    ledger.add(shot, &record, &[], None).unwrap();
     drop(ledger);
     fs::create_dir_all(shot_folder(folder.path(), shot)).unwrap();
     let house = House::open(folder.path()).await;

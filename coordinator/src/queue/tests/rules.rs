@@ -96,7 +96,7 @@ impl Model {
                 let record = ShotRecord { plan, frames, submitted_s: 7, stage, note, workers };
                 self.last += 1;
                 let id = ShotId(self.last);
-                self.ledger.add(id, &record, &cameras).unwrap();
+                self.ledger.add(id, &record, &cameras, None).unwrap();
                 self.book.add(Saved { id, record, progress: Progress::default() });
                 self.acknowledged.insert(id, (Stage::Open, priority));
             }
