@@ -52,6 +52,9 @@ pub struct Config {
     pub redirect_above_bytes: u64,
     /// Most connections at once, greeting or greeted.
     pub connections_max: usize,
+    /// Most desks at once, each a line of someone who asks the API; others wait for their
+    /// turn.
+    pub desks_max: usize,
     /// Whom it lets in.
     pub trust: Trust,
     /// Most connections that have not greeted yet; the oldest of them gives way to a new
@@ -76,6 +79,7 @@ impl Default for Config {
             blob_memory_bytes: 512 << 20,
             redirect_above_bytes: 8 << 20,
             connections_max: 16_896,
+            desks_max: 128,
             trust: Trust::Loopback,
             strangers_max: 256,
             greeting_limit: Duration::from_secs(5),

@@ -24,8 +24,6 @@ const BULK_QUEUE: usize = 4096;
 /// A client is given up after this many times the silence that a worker may keep.
 const CLIENT_PATIENCE: u32 = 4;
 
-/// Desks at once: each may be sending something long.
-const DESKS_MAX: usize = 32;
 /// How long a desk may take to take an answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 
@@ -77,7 +75,7 @@ impl Admission {
             last_id: Arc::default(),
             events,
             api,
-            desks: Arc::new(Semaphore::new(DESKS_MAX)),
+            desks: Arc::new(Semaphore::new(config.desks_max)),
             stop,
             unsent,
         }
@@ -109,6 +107,17 @@ pub async fn serve(
         let text = "a coordinator serves workers and clients; a peer asks workers";
         return greeted.refuse(Refusal::Malformed, text).await;
     }
+    let place = match greeted.hello().role {
+        Role::Desk => match place(&admission).await {
+            Some(place) => Some(place),
+            None => {
+                let text = "as many are served at the desk as there are places; try again in a \
+                            moment";
+                return greeted.refuse(Refusal::Full, text).await;
+            }
+        },
+        _ => None,
+    };
     let id = admission.last_id.fetch_add(1, Ordering::Relaxed) + 1;
     let welcomed = greeted.welcome(id, &admission.name, admission.heartbeat, admission.silence);
     let (connection, hello) = match welcomed.await {
@@ -121,7 +130,10 @@ pub async fn serve(
     let (is_worker, threads) = match hello.role {
         Role::Worker { threads, .. } => (true, threads),
         Role::Client | Role::Peer => (false, 0),
-        Role::Desk => return desk(connection, &admission).await,
+        Role::Desk => {
+            desk(connection, &admission).await;
+            return drop(place);
+        }
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();
@@ -173,10 +185,20 @@ pub async fn serve(
     }
 }
 
+/// A place at the desk, for which whoever comes waits for a moment; `None` if all stay taken.
+async fn place(admission: &Admission) -> Option<OwnedSemaphorePermit> {
+    // The other side gives up a greeting that takes too long.
+    let patience = admission.greeting_limit / 2;
+    tokio::select! {
+        () = admission.stop.cancelled() => None,
+        taken = tokio::time::timeout(patience, admission.desks.clone().acquire_owned()) => {
+            taken.ok()?.ok()
+        }
+    }
+}
+
 /// Answers the requests of one desk, one after the other.
 async fn desk(connection: Connection<TcpStream>, admission: &Admission) {
-    // Whoever comes when all places are taken is hung up on, and tries again.
-    let Ok(_place) = admission.desks.try_acquire() else { return };
     let (mut reader, mut writer) = connection.split();
     let patience = admission.silence * CLIENT_PATIENCE;
     loop {
