@@ -19,7 +19,7 @@ use serde::de::DeserializeOwned;
 use serde_json::json;
 use std::io::Write;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::ask::{Answer, Line, Turn};
 use terrafarm_coordinator::view::{ShotView, WorkerView};
 use terrafarm_wire::link::Trust;
@@ -161,7 +161,15 @@ pub fn shots(args: &args::Shots) -> anyhow::Result<Outcome> {
         }
         let head = ["shot", "state", "priority", "frames", "frames/s", "left", "name"];
         let rows: Vec<_> = shots.iter().map(shot_row).collect();
-        say(table(&head, &rows).trim_end())
+        say(table(&head, &rows).trim_end())?;
+        if args.shot.is_some() {
+            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+            for past in shots.iter().flat_map(|shot| &shot.history) {
+                let ago = duration(now.saturating_sub(past.at_s) as f64);
+                say(&printable(&format!("{ago} ago: {}", past.what)))?;
+            }
+        }
+        Ok(Outcome::Done)
     })
 }
 

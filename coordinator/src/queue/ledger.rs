@@ -229,7 +229,7 @@ impl Ledger {
     }
 
     /// Forgets that these frames were finished: their pictures are not what they should be,
-    /// or their records are damaged. Returns how far the shot is now: all of its frames are
+    /// or their records are damaged. Those that failed are left as they are. Returns how far the shot is now: all of its frames are
     /// counted again, since nobody knows as what a damaged one was counted.
     ///
     /// # Errors
@@ -245,7 +245,12 @@ impl Ledger {
             let row = shots.get(shot.0)?.map(|row| row.value()).unwrap_or_default();
             let mut progress = Progress { done: 0, failed: 0, ..Progress::from_row(row) };
             for &index in frames {
-                table.remove((shot.0, index))?;
+                let kept = table.get((shot.0, index))?;
+                let kept = kept.map(|text| FrameRecord::read(text.value()));
+                // One that could not be rendered has no pixels that could be wrong.
+                if !matches!(kept, Some(Some(FrameRecord::Failed(_)))) {
+                    table.remove((shot.0, index))?;
+                }
             }
             for row in table.range((shot.0, 0)..=(shot.0, u32::MAX))? {
                 match FrameRecord::read(row?.1.value()) {

@@ -4,14 +4,19 @@
 use super::QueueError;
 use super::plan::{ShotPlan, Source};
 use crate::sink::manifest::{FrameEntry, WorkerEntry};
+use crate::view::Past;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use std::time::{SystemTime, UNIX_EPOCH};
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::{Shading, Sky};
 use terrafarm_wire::limits::clip_name;
+
+/// Most that is kept of a shot's history.
+const HISTORY_MAX: usize = 32;
 
 /// How far a shot has come, as it is kept. What it does at the moment follows from it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -53,6 +58,9 @@ pub struct ShotRecord {
     pub note: String,
     /// Who rendered, as far as the farm has said.
     pub workers: Vec<WorkerEntry>,
+    /// What happened to it that people should know of, oldest first.
+    #[serde(default)]
+    pub history: Vec<Past>,
 }
 
 /// What became of one frame.
@@ -110,6 +118,15 @@ pub struct Saved {
 }
 
 impl ShotRecord {
+    /// Notes what happened to it just now; of too much, the oldest is forgotten.
+    pub fn happened(&mut self, what: String) {
+        if self.history.len() >= HISTORY_MAX {
+            self.history.remove(0);
+        }
+        let at_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+        self.history.push(Past { at_s, what });
+    }
+
     /// Reads what was kept of a shot. One that cannot be read, or that no farm would render,
     /// is a shot that failed, and its note says why: what is on the disk is left as it is.
     pub fn read(text: &[u8]) -> Self {
@@ -139,6 +156,7 @@ impl ShotRecord {
             stage: Stage::Failed,
             note,
             workers: Vec::new(),
+            history: Vec::new(),
             plan: ShotPlan {
                 name: clip_name(plan["name"].as_str().unwrap_or("unreadable")),
                 priority: plan["priority"]

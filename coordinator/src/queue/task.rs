@@ -7,6 +7,7 @@
 //! frame of this one.
 
 mod close;
+mod doubt;
 mod show;
 mod stay;
 
@@ -21,6 +22,7 @@ use super::{
 };
 use crate::driver::FarmLine;
 use crate::order::{Order, OrderError};
+use doubt::Doubted;
 use stay::{Picture, Stay, StayId};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::Ordering;
@@ -64,6 +66,8 @@ enum News {
     Lacks(StayId, BlobHash),
     /// The disk does not read terrain that the farm asks for.
     Unread(StayId, BlobHash),
+    /// Frames of a shot have pixels of a worker that is not believed any more.
+    Doubted(Doubted),
     /// A picture was written, or not.
     Stored(Picture, Result<u64, QueueError>),
     /// A shot was finished, or not.
@@ -101,6 +105,11 @@ pub(super) struct Task {
     outcomes: Vec<Outcome>,
     /// Pictures for which there was no room.
     unwritten: Vec<Picture>,
+    /// Frames on their way to the disk that are not believed any more: they are rendered
+    /// again. By shot, so that those of earlier stays are forgotten with a new one.
+    distrusted: BTreeSet<(ShotId, StayId, FrameIndex)>,
+    /// Doubts that the disk did not let be recorded.
+    doubts: Vec<Doubted>,
     /// Why nothing goes on: the disk is full or fails.
     stalled: Option<QueueError>,
     /// The shot whose film is being made, and what stops that when it is dropped.
@@ -152,6 +161,8 @@ impl Task {
             writers: Arc::new(Semaphore::new(WRITERS)),
             outcomes: Vec::new(),
             unwritten: Vec::new(),
+            distrusted: BTreeSet::new(),
+            doubts: Vec::new(),
             stalled: None,
             finishing: None,
             losses: BTreeMap::new(),
@@ -223,6 +234,7 @@ impl Task {
                 self.lacks(stay, hash, !is_here).await;
             }
             News::Unread(stay, hash) => self.lacks(stay, hash, true).await,
+            News::Doubted(doubted) => self.doubt(doubted).await,
             News::Stored(picture, stored) => self.stored(picture, stored).await,
             News::Finished(shot, result) => self.finished(shot, result).await,
             News::Swept(result) => {
@@ -294,6 +306,7 @@ impl Task {
             stage: Stage::Open,
             note: String::new(),
             workers: Vec::new(),
+            history: Vec::new(),
             plan,
         };
         let id = ShotId(self.farm.last_shot().fetch_add(1, Ordering::Relaxed) + 1);

@@ -12,7 +12,9 @@ use super::*;
 use crate::sink::manifest::Manifest;
 use house::{House, Land, plan, until};
 use std::fs;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::WorkerId;
+use terrafarm_common::image::Rgb8;
 
 fn manifest(files: &ShotFiles) -> Manifest {
     serde_json::from_slice(&fs::read(files.manifest()).unwrap()).unwrap()
@@ -148,9 +150,10 @@ fn keys_of_submissions_are_forgotten_when_they_are_old_and_not_before() {
     let land = Land::new(folder.path());
     let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
     for (number, submitted_s) in [(1, 100), (2, 200), (3, 300)] {
-        let (plan, note, workers) = (plan(&land, 1), String::new(), Vec::new());
+        let (note, workers, history) = (String::new(), Vec::new(), Vec::new());
+        let plan = plan(&land, 1);
         let (frames, stage) = (1, Stage::Open);
-        let record = ShotRecord { plan, frames, submitted_s, stage, note, workers };
+        let record = ShotRecord { plan, frames, submitted_s, stage, note, workers, history };
         let key = SubmissionKey::new(&format!("k-{number}"), b"").unwrap();
         ledger.add(ShotId(number), &record, &[], Some(&key)).unwrap();
     }
@@ -221,6 +224,42 @@ async fn damaged_pictures_are_rendered_again_before_the_film_is_made() {
     let rendered = house.rendered();
     assert_eq!(rendered.iter().filter(|&&frame| frame == done).count(), 2, "{rendered:?}");
     assert_eq!(manifest(&files).frames.len(), 4);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn frames_of_a_worker_that_an_audit_finds_at_fault_are_rendered_again() {
+    const FRAMES: u32 = 60;
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut farm = crate::Config::default();
+    farm.scheduler.audit = Share::from_millionths(1_000_000).unwrap();
+    let house = House::with_farm(house::config(folder.path()), farm).await;
+    land.send(&house.queue).await;
+    let mut plan = plan(&land, FRAMES);
+    plan.film = Some(Film::Mp4);
+    let shot = house.queue.submit(plan).await.unwrap();
+    // Alone it is not audited, and what it sends is finished.
+    let _liar = house.hire_liar(WorkerId(1)).await;
+    until(&house.queue, |list| list[0].frames_done >= 5).await;
+    house.queue.order(Order::Pause(shot)).await.unwrap();
+    assert!(house.queue.shot(shot).unwrap().frames_done < FRAMES);
+    let _honest = [house.hire(WorkerId(2)).await, house.hire(WorkerId(3)).await];
+    house.queue.order(Order::Resume(shot)).await.unwrap();
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    let view = house.queue.shot(shot).unwrap();
+    assert_eq!((view.frames_done, view.frames_failed, view.film), (FRAMES, 0, true));
+    let what = &view.history[0].what;
+    assert!(what.contains("rendered again") && what.contains("worker-1"), "{what}");
+    let files = house.queue.files(shot).unwrap();
+    for frame in &manifest(&files).frames {
+        let pixels = vec![frame.index as u8; (house::SIZE.0 * house::SIZE.1 * 3) as usize];
+        let right = Rgb8::from_pixels(house::SIZE.0, house::SIZE.1, pixels).unwrap();
+        let hash = crate::sink::pixels_sha256(&right).to_hex();
+        assert_eq!(frame.sha256, hash, "frame {}", frame.index);
+    }
+    // It is remembered with the shot.
+    let house = house.restart().await;
+    assert_eq!(house.queue.shot(shot).unwrap().history, view.history);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -158,6 +158,7 @@ impl Task {
                         record.stage = Stage::Open;
                         record.note =
                             format!("{count} pictures were damaged or gone and are rendered again");
+                        record.happened(record.note.clone());
                         self.keep_or_stall(shot, record).await;
                     }
                     Err(why) => self.stall(why).await,
@@ -216,6 +217,9 @@ impl Task {
         self.record().await;
         if self.stalled.is_some() {
             return;
+        }
+        for doubted in std::mem::take(&mut self.doubts) {
+            self.doubt(doubted).await;
         }
         for picture in std::mem::take(&mut self.unwritten) {
             self.write(picture);

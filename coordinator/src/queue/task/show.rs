@@ -77,6 +77,7 @@ impl Task {
             // Of a shot that is done, a note says why there is none.
             film: record.stage == Stage::Done && plan.film.is_some() && record.note.is_empty(),
             last_frame: shot.progress.last.map(|index| plan.first_frame + index),
+            history: record.history.clone(),
         })
     }
 }

@@ -56,8 +56,12 @@ impl House {
     }
 
     pub async fn with(config: QueueConfig) -> Self {
+        Self::with_farm(config, Config::default()).await
+    }
+
+    pub async fn with_farm(config: QueueConfig, farm: Config) -> Self {
         let stop = CancellationToken::new();
-        let line = FarmLine::to_new_farm(Config::default(), stop.clone());
+        let line = FarmLine::to_new_farm(farm, stop.clone());
         let deadline = Instant::now() + PATIENCE;
         let (queue, task) = loop {
             match Queue::open(config.clone(), line.clone()).await {
@@ -95,6 +99,11 @@ impl House {
         tokio::spawn(work(self.line.clone(), worker, jobs, self.log.clone()))
     }
 
+    /// A worker all of whose pixels are wrong.
+    pub async fn hire_liar(&self, worker: WorkerId) -> JoinHandle<()> {
+        tokio::spawn(paint(self.line.clone(), worker, usize::MAX, self.log.clone(), 1))
+    }
+
     /// The numbers of the frames that were rendered, in order.
     pub fn rendered(&self) -> Vec<FrameIndex> {
         self.log.lock().unwrap().iter().map(|(_, frame)| *frame).collect()
@@ -119,6 +128,11 @@ impl House {
 /// Renders: asks for the whole terrain of a shot, then answers grants by their camera's
 /// position.
 pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
+    paint(line, worker, jobs, log, 0).await;
+}
+
+/// As [`work`], in another colour.
+async fn paint(line: FarmLine, worker: WorkerId, jobs: usize, log: Log, fault: u8) {
     let mut end = line.hire(worker).await;
     let (mut wanted, mut waiting) = (Vec::new(), Vec::<Grant>::new());
     let (mut index_of, mut answered) = (HashMap::new(), 0);
@@ -162,15 +176,15 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
             answered += 1;
             let number = grant.camera.position.x as FrameIndex;
             log.lock().unwrap().push((grant.shot, number));
-            if !line.work(worker, done(&grant, number)).await {
+            if !line.work(worker, done(&grant, number, fault)).await {
                 return;
             }
         }
     }
 }
 
-fn done(grant: &Grant, number: FrameIndex) -> Done {
-    let pixels = vec![number as u8; grant.region.area() as usize * 3];
+fn done(grant: &Grant, number: FrameIndex, fault: u8) -> Done {
+    let pixels = vec![number as u8 ^ fault; grant.region.area() as usize * 3];
     let report = RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
     let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
     let timesheet = Timesheet::default();

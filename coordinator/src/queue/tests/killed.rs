@@ -53,6 +53,7 @@ async fn a_film_that_is_being_made_does_not_hold_up_the_end() {
         stage: Stage::Finishing,
         note: String::new(),
         workers: Vec::new(),
+        history: Vec::new(),
     };
     let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
     ledger.add(shot, &record, &[], None).unwrap();
