@@ -281,15 +281,19 @@ fn reason(body: &[u8]) -> String {
 mod tests {
     use super::*;
     use crate::driver::{Config, run};
+    use tokio::io::AsyncReadExt;
     use tokio::net::TcpListener;
     use tokio_util::sync::CancellationToken;
 
     /// A coordinator for so many desks.
     async fn coordinator(desks_max: usize) -> (String, CancellationToken) {
+        let greeting_limit = Duration::from_millis(200);
+        serve(Config { desks_max, greeting_limit, ..Config::default() }).await
+    }
+
+    async fn serve(config: Config) -> (String, CancellationToken) {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("an address").to_string();
-        let config =
-            Config { desks_max, greeting_limit: Duration::from_millis(200), ..Config::default() };
         let stop = CancellationToken::new();
         tokio::spawn(run(config, listener, stop.clone().cancelled_owned()));
         (address, stop)
@@ -315,6 +319,79 @@ mod tests {
         let answer = second.await.expect("no panic");
         assert!(answer.is_ok(), "{answer:?}");
         assert_eq!(told.recv().await, None, "once is enough");
+        stop.cancel();
+    }
+
+    /// A desk of which nothing more comes after so many bytes, until it is told to go on.
+    async fn halting(
+        address: &str,
+        bytes: u64,
+        go_on: CancellationToken,
+    ) -> Connection<tokio::io::DuplexStream> {
+        use terrafarm_wire::link::greet;
+        use terrafarm_wire::message::Hello;
+        let (near, far) = tokio::io::duplex(1 << 16);
+        let stream = TcpStream::connect(address).await.expect("a coordinator");
+        tokio::spawn(async move {
+            let (mut from_near, mut to_near) = tokio::io::split(far);
+            let (mut from_coordinator, mut to_coordinator) = stream.into_split();
+            let up = async {
+                let mut some = (&mut from_near).take(bytes);
+                tokio::io::copy(&mut some, &mut to_coordinator).await.expect("sent");
+                go_on.cancelled().await;
+                let _ = tokio::io::copy(&mut from_near, &mut to_coordinator).await;
+            };
+            tokio::join!(up, async {
+                let _ = tokio::io::copy(&mut from_coordinator, &mut to_near).await;
+            });
+        });
+        let hello = Hello::new("halting", Role::Desk);
+        let greeted = greet(near, None, hello, Duration::from_secs(60)).await;
+        greeted.expect("it is let in").0
+    }
+
+    #[tokio::test]
+    async fn long_bodies_wait_for_memory_and_short_ones_do_not() {
+        const LONG: usize = 5 << 20;
+        let config = Config {
+            bodies_bytes_max: LONG + 1,
+            bodies_patience: Duration::from_secs(1),
+            ..Config::default()
+        };
+        let (address, stop) = serve(config).await;
+        let request = |number, length: usize| -> Message {
+            let (verb, path) = (Verb::Put, format!("/api/v1/blobs/{}", "0".repeat(64)));
+            Request { number, verb, path, range: None, body: vec![0; length].into() }.into()
+        };
+        let go_on = CancellationToken::new();
+        let mut first = halting(&address, 3 << 20, go_on.clone()).await;
+        let first = tokio::spawn(async move {
+            first.send(&request(1, LONG)).await.expect("sent");
+            first.recv().await.expect("answered").expect("answered")
+        });
+        let mut line = Line::open(&address, &Trust::Loopback).await.expect("a place");
+        let path = format!("/api/v1/blobs/{}", "0".repeat(64));
+        let ask = async |line: &mut Line, length: usize| {
+            line.ask(Verb::Put, &path, None, vec![0; length].into()).await
+        };
+        // Until the first one has its share.
+        let turned_away = loop {
+            match ask(&mut line, LONG).await {
+                Err(AskError::Refused { .. }) => tokio::task::yield_now().await,
+                other => break other,
+            }
+        };
+        assert!(matches!(turned_away, Err(AskError::Lost { .. })), "{turned_away:?}");
+        // It is answered: there is no queue.
+        let short = ask(&mut line, 1 << 20).await;
+        assert!(matches!(short, Err(AskError::Refused { status: 501, .. })), "{short:?}");
+        assert!(!first.is_finished());
+        go_on.cancel();
+        let Message::Response(answer) = first.await.expect("no panic") else { panic!("no answer") };
+        assert_eq!(answer.status, 501);
+        let turn = Turn::new(Duration::from_secs(60), |_| {});
+        let long = line.ask_again(Verb::Put, &path, None, vec![0; LONG].into(), &turn).await;
+        assert!(matches!(long, Err(AskError::Refused { status: 501, .. })), "{long:?}");
         stop.cancel();
     }
 

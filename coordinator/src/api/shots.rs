@@ -1,13 +1,14 @@
 //! Routes about shots: lists, submissions, orders.
 
+use super::Desk;
 use super::board::{Board, Page, Window};
+use super::carry::Paid;
 use super::refusal::Refusal;
-use super::{BULKY_AT_ONCE, Desk};
 use crate::order::Order;
 use crate::queue::{ShotPlan, SubmissionKey, parse_hash};
 use crate::view::ShotView;
 use axum::Json;
-use axum::body::Bytes;
+use axum::body::{Bytes, HttpBody};
 use axum::extract::{Path, Query, Request, State};
 use axum::http::HeaderMap;
 use axum::middleware::Next;
@@ -16,6 +17,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use std::sync::Arc;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId, WorkerId};
+use terrafarm_wire::limits::DESK_BODY_MAX;
 
 /// Says that a submission is the same one when it is sent again.
 const KEY_HEADER: &str = "idempotency-key";
@@ -134,17 +136,22 @@ fn hash(text: &str) -> Result<BlobHash, Refusal> {
     parse_hash(text).ok_or_else(|| Refusal::malformed("a hash has 64 hexadecimal digits"))
 }
 
-/// Lets so many long bodies come at once as [`BULKY_AT_ONCE`]; the others wait.
-pub(super) async fn one_of_few(
+/// Has a body wait until there is memory for it. What came over the link has its share already.
+pub(super) async fn within_budget(
     State(desk): State<Arc<Desk>>,
     request: Request,
     next: Next,
 ) -> Response {
-    let Ok(_one) = desk.bulky.acquire().await else {
-        let text = format!("{BULKY_AT_ONCE} bodies are taken at once");
-        return Refusal::malformed(text).into_response();
-    };
-    next.run(request).await
+    if request.extensions().get::<Paid>().is_some() {
+        return next.run(request).await;
+    }
+    // A body of which nobody says how long it is may be as long as any.
+    let length = request.body().size_hint().upper().unwrap_or(u64::MAX);
+    let length = usize::try_from(length).unwrap_or(usize::MAX).min(DESK_BODY_MAX);
+    match desk.budget.claim(length).await {
+        Some(_claim) => next.run(request).await,
+        None => Refusal::busy(desk.budget.patience()).into_response(),
+    }
 }
 
 /// What came of an order, as JSON.
