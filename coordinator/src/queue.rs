@@ -74,6 +74,8 @@ pub struct QueueConfig {
     pub reserve_bytes: u64,
     /// Terrain that no unfinished shot needs is kept up to this size, bytes.
     pub terrain_cache_bytes: u64,
+    /// How long it is kept at most after it came or was asked for.
+    pub terrain_kept: Duration,
     /// How long terrain is kept in any case after it came or was asked for: a submission
     /// may be on its way.
     pub terrain_grace: Duration,
@@ -90,6 +92,7 @@ impl QueueConfig {
             folder: folder.into(),
             reserve_bytes: 256 << 20,
             terrain_cache_bytes: 8 << 30,
+            terrain_kept: Duration::from_secs(14 * 24 * 3600),
             terrain_grace: Duration::from_secs(3600),
             retry: Duration::from_secs(3),
             active: 16,

@@ -230,14 +230,24 @@ impl Blobs {
     }
 
     /// Removes what no unfinished shot needs and nobody asked for lately, the longest
-    /// unused first, until the rest is within its limit. Returns bytes removed.
+    /// unused first, until the rest is within its limit and none of it is too old. Returns
+    /// bytes removed.
+    ///
+    /// Of a shot whose index is damaged or gone nobody knows what it needs: its terrain counts
+    /// as unused, since whoever sends the index again is asked for the rest, too.
     ///
     /// # Errors
-    /// If the index of a store in use cannot be read: then nothing is removed.
+    /// If the disk does not read the index of a store in use: then nothing is removed.
     pub fn sweep(&self, in_use: &HashSet<BlobHash>) -> Result<u64, QueueError> {
         let mut needed = HashSet::new();
         for &index in in_use {
-            needed.extend(self.store(index)?.into_iter().map(|(hash, _)| hash.to_hex()));
+            match self.store(index) {
+                Ok(all) => needed.extend(all.into_iter().map(|(hash, _)| hash.to_hex())),
+                Err(why @ (QueueError::Missing(_) | QueueError::Unfit(_))) => {
+                    tracing::warn!(%index, "nobody knows what a shot needs of its terrain: {why}");
+                }
+                Err(why) => return Err(why),
+            }
         }
         let now = SystemTime::now();
         let mut idle = Vec::new();
@@ -255,8 +265,11 @@ impl Blobs {
         idle.sort();
         let mut removed = 0;
         for (used, bytes, path) in idle {
-            let young = now.duration_since(used).unwrap_or_default() < self.config.terrain_grace;
-            if idle_bytes - removed <= self.config.terrain_cache_bytes || young {
+            let age = now.duration_since(used).unwrap_or_default();
+            let is_young = age < self.config.terrain_grace;
+            let is_old = age >= self.config.terrain_kept;
+            let is_within = idle_bytes - removed <= self.config.terrain_cache_bytes;
+            if is_young || (is_within && !is_old) {
                 break;
             }
             fs::remove_file(&path).map_err(|why| self.error("remove", &path, &why))?;
@@ -277,4 +290,48 @@ impl Blobs {
 /// What is in a folder; nothing if it is not there.
 fn entries(folder: &Path) -> impl Iterator<Item = fs::DirEntry> {
     fs::read_dir(folder).into_iter().flatten().flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::house::Land;
+    use super::*;
+    use std::time::Duration;
+
+    const DAY: Duration = Duration::from_secs(24 * 3600);
+
+    /// Terrain that came so many days ago.
+    fn aged(blobs: &Blobs, land: &Land, days: u32) {
+        for (hash, bytes) in &land.blobs {
+            blobs.put(*hash, bytes).expect("room");
+            blobs.touch(*hash, SystemTime::now() - days * DAY);
+        }
+    }
+
+    /// How many of a store's blobs are there.
+    fn here(blobs: &Blobs, land: &Land) -> usize {
+        land.blobs.iter().filter(|(hash, _)| blobs.path(*hash).exists()).count()
+    }
+
+    #[test]
+    fn terrain_that_no_shot_needs_goes_when_it_is_old_however_little_it_is() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let blobs = Blobs::new(&Arc::new(QueueConfig::new(folder.path())));
+        let land = Land::new(folder.path());
+        let (all, index) = (land.blobs.len(), land.index);
+        // Tiles came, and their index never did.
+        aged(&blobs, &land, 13);
+        fs::remove_file(blobs.path(index)).expect("it was there");
+        blobs.sweep(&HashSet::new()).expect("readable");
+        assert_eq!(here(&blobs, &land), all - 1, "not yet");
+        aged(&blobs, &land, 15);
+        blobs.sweep(&HashSet::from([index])).expect("readable");
+        assert_eq!(here(&blobs, &land), all, "a shot needs it");
+        // The index of a shot is gone: that holds up nothing.
+        fs::remove_file(blobs.path(index)).expect("it was there");
+        let removed = blobs.sweep(&HashSet::from([index])).expect("readable");
+        assert_eq!(here(&blobs, &land), 0);
+        let bytes = land.blobs.iter().filter(|(hash, _)| *hash != index);
+        assert_eq!(removed, bytes.map(|(_, bytes)| bytes.len() as u64).sum::<u64>());
+    }
 }
