@@ -3,7 +3,7 @@
 
 use crate::support::{Dir, Running, World, frame_hashes, run, succeed, terrafarm, worker};
 use glam::DVec3;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Lines, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::path::Path;
 use std::process::Command;
@@ -76,20 +76,23 @@ impl Office {
         reply.json()
     }
 
-    /// Asks again and again until something holds of an answer.
+    /// Asks until something holds of an answer: again whenever an event says that something
+    /// has changed.
     pub fn wait(
         &self,
         path: &str,
         holds: impl Fn(&serde_json::Value) -> bool,
     ) -> serde_json::Value {
         let deadline = Instant::now() + PATIENCE;
+        // Before the first question, so that no change is missed.
+        let mut events = Events::open(&self.http, "");
         loop {
             let answer = self.json(path);
             if holds(&answer) {
                 return answer;
             }
             assert!(Instant::now() < deadline, "{path} stays {answer}");
-            std::thread::yield_now();
+            events.read();
         }
     }
 }
@@ -421,23 +424,39 @@ fn floods_of_silent_and_slow_connections_keep_nobody_out() {
     assert_eq!(http(&office.http, "GET", "/", &[("X-Long", &long)], b"").status, 431);
 }
 
-/// A stream of events: what it says first, and when.
-pub fn first_events(address: &str, query: &str) -> (Vec<(String, serde_json::Value)>, TcpStream) {
-    let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(stream, "GET /api/v1/events?{query} HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
-    let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
-    let (mut events, mut name) = (Vec::new(), String::new());
-    while events.len() < 3 {
-        let line = lines.next().expect("the stream goes on").unwrap();
-        if let Some(text) = line.strip_prefix("event: ") {
-            name = text.to_owned();
-        } else if let Some(text) = line.strip_prefix("data: ") {
-            events.push((name.clone(), serde_json::from_str(text).unwrap()));
-        }
-        assert!(!line.starts_with("HTTP/1.1 5"), "{line}");
+/// A stream of events.
+pub struct Events {
+    lines: Lines<BufReader<TcpStream>>,
+    name: String,
+}
+
+impl Events {
+    /// Asks for one.
+    pub fn open(address: &str, query: &str) -> Self {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(stream, "GET /api/v1/events?{query} HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+        Events { lines: BufReader::new(stream).lines(), name: String::new() }
     }
-    (events, stream)
+
+    /// Waits for the next one: its name and what it says.
+    pub fn read(&mut self) -> (String, serde_json::Value) {
+        loop {
+            let line = self.lines.next().expect("the stream goes on").unwrap();
+            assert!(!line.starts_with("HTTP/1.1 5"), "{line}");
+            if let Some(text) = line.strip_prefix("event: ") {
+                self.name = text.to_owned();
+            } else if let Some(text) = line.strip_prefix("data: ") {
+                return (self.name.clone(), serde_json::from_str(text).unwrap());
+            }
+        }
+    }
+}
+
+/// A stream of events, and what it says first.
+pub fn first_events(address: &str, query: &str) -> (Vec<(String, serde_json::Value)>, Events) {
+    let mut events = Events::open(address, query);
+    ((0..3).map(|_| events.read()).collect(), events)
 }
 
 #[test]

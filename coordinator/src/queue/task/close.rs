@@ -22,6 +22,7 @@ impl Task {
             outcomes.iter().map(|frame| (frame.shot, frame.index, frame.record.clone())).collect();
         match self.ledger(move |ledger| ledger.record(&frames)).await {
             Ok(progress) => {
+                tracing::debug!(frames = outcomes.len(), "frames recorded");
                 for outcome in outcomes {
                     self.book.count_in_hand(outcome.shot, -1);
                     self.taken(outcome.stay, outcome.frame).await;
