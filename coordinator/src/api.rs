@@ -30,7 +30,7 @@ mod workers;
 pub use access::{Access, WebKey};
 pub use serve::Web;
 
-pub(crate) use budget::{Budget, Claim};
+pub(crate) use budget::Budget;
 pub(crate) use carry::Link;
 pub(crate) use serve::serve;
 
