@@ -163,3 +163,32 @@ async fn in_time(limit: Duration, request: Request, next: Next) -> Response {
     let answered = tokio::time::timeout(limit, next.run(request)).await;
     answered.unwrap_or_else(|_| Refusal::too_slow(limit).into_response())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::body::Body;
+    use axum::http::{StatusCode, header};
+    use tower::ServiceExt;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_long_body_for_which_there_is_no_memory_is_refused_with_when_to_come_back() {
+        let budget = Budget::new(4 << 20, Duration::from_secs(60));
+        let (farm, stop) = (FarmLine::to_nobody(), CancellationToken::new());
+        let desk = Desk::new("test", farm, None, Arc::default(), budget.clone(), stop);
+        let routes = router(desk);
+        let post = async |length: usize| {
+            let body = Body::from(vec![b' '; length]);
+            let request = Request::post("/api/v1/shots").body(body).expect("a request");
+            routes.clone().oneshot(request).await.expect("an answer")
+        };
+        let others = budget.claim(3 << 20).await.expect("room");
+        let refused = post(2 << 20).await;
+        assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert_eq!(refused.headers()[header::RETRY_AFTER], "5");
+        // There is no queue: that is an answer.
+        assert_eq!(post(1000).await.status(), StatusCode::NOT_IMPLEMENTED);
+        drop(others);
+        assert_eq!(post(2 << 20).await.status(), StatusCode::NOT_IMPLEMENTED);
+    }
+}

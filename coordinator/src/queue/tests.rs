@@ -236,15 +236,15 @@ async fn frames_of_a_worker_that_an_audit_finds_at_fault_are_rendered_again() {
     let house = House::with_farm(house::config(folder.path()), farm).await;
     land.send(&house.queue).await;
     let mut plan = plan(&land, FRAMES);
-    plan.film = Some(Film::Mp4);
+    (plan.film, plan.frames_in_flight) = (Some(Film::Mp4), 16);
     let shot = house.queue.submit(plan).await.unwrap();
     // Alone it is not audited, and what it sends is finished.
-    let _liar = house.hire_liar(WorkerId(1)).await;
-    until(&house.queue, |list| list[0].frames_done >= 5).await;
-    house.queue.order(Order::Pause(shot)).await.unwrap();
-    assert!(house.queue.shot(shot).unwrap().frames_done < FRAMES);
+    let permits = Arc::new(tokio::sync::Semaphore::new(5));
+    let _liar = house.hire_liar(WorkerId(1), permits.clone()).await;
+    until(&house.queue, |list| list[0].frames_done == 5).await;
     let _honest = [house.hire(WorkerId(2)).await, house.hire(WorkerId(3)).await];
-    house.queue.order(Order::Resume(shot)).await.unwrap();
+    until(&house.queue, |list| list[0].frames_done >= 10).await;
+    permits.add_permits(FRAMES as usize);
     until(&house.queue, |list| list[0].state == ShotState::Done).await;
     let view = house.queue.shot(shot).unwrap();
     assert_eq!((view.frames_done, view.frames_failed, view.film), (FRAMES, 0, true));

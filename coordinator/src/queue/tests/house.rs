@@ -22,6 +22,7 @@ use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::Message;
 use terrafarm_wire::message::{Done, Grant, RenderReport, Timesheet, WantBlobs};
 use terrafarm_wire::pixels::Pixels;
+use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 
 /// How long anything may take before a test gives up on it.
@@ -99,9 +100,10 @@ impl House {
         tokio::spawn(work(self.line.clone(), worker, jobs, self.log.clone()))
     }
 
-    /// A worker all of whose pixels are wrong.
-    pub async fn hire_liar(&self, worker: WorkerId) -> JoinHandle<()> {
-        tokio::spawn(paint(self.line.clone(), worker, usize::MAX, self.log.clone(), 1))
+    /// A worker all of whose pixels are wrong; it answers a grant for each permit.
+    pub async fn hire_liar(&self, worker: WorkerId, permits: Arc<Semaphore>) -> JoinHandle<()> {
+        let (line, log) = (self.line.clone(), self.log.clone());
+        tokio::spawn(paint(line, worker, log, permits, 1))
     }
 
     /// The numbers of the frames that were rendered, in order.
@@ -128,14 +130,15 @@ impl House {
 /// Renders: asks for the whole terrain of a shot, then answers grants by their camera's
 /// position.
 pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
-    paint(line, worker, jobs, log, 0).await;
+    let permits = Arc::new(Semaphore::new(jobs.min(Semaphore::MAX_PERMITS)));
+    paint(line, worker, log, permits, 0).await;
 }
 
-/// As [`work`], in another colour.
-async fn paint(line: FarmLine, worker: WorkerId, jobs: usize, log: Log, fault: u8) {
+/// As [`work`], a grant for each permit, in another colour.
+async fn paint(line: FarmLine, worker: WorkerId, log: Log, permits: Arc<Semaphore>, fault: u8) {
     let mut end = line.hire(worker).await;
     let (mut wanted, mut waiting) = (Vec::new(), Vec::<Grant>::new());
-    let (mut index_of, mut answered) = (HashMap::new(), 0);
+    let mut index_of = HashMap::new();
     while let Some(message) = end.recv().await {
         match message {
             Message::OpenShot(open) => {
@@ -170,10 +173,7 @@ async fn paint(line: FarmLine, worker: WorkerId, jobs: usize, log: Log, fault: u
         }
         while wanted.is_empty() && !waiting.is_empty() {
             let grant = waiting.remove(0);
-            if answered >= jobs {
-                std::future::pending::<()>().await;
-            }
-            answered += 1;
+            permits.acquire().await.unwrap().forget();
             let number = grant.camera.position.x as FrameIndex;
             log.lock().unwrap().push((grant.shot, number));
             if !line.work(worker, done(&grant, number, fault)).await {
