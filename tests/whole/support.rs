@@ -150,12 +150,17 @@ impl Running {
 
     /// Waits for a line that contains a text, and returns it.
     pub fn expect(&mut self, text: &str) -> String {
+        self.expect_one_of(&[text])
+    }
+
+    /// Waits for a line that contains one of these texts, and returns it.
+    pub fn expect_one_of(&mut self, texts: &[&str]) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
             match self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
                 Ok(line) => {
                     self.seen.push(line.clone());
-                    if line.contains(text) {
+                    if texts.iter().any(|text| line.contains(text)) {
                         return line;
                     }
                 }
@@ -165,7 +170,7 @@ impl Running {
                     } else {
                         "ended before"
                     };
-                    panic!("{text:?} {how}; lines so far:\n{}", self.seen.join("\n"));
+                    panic!("{texts:?} {how}; lines so far:\n{}", self.seen.join("\n"));
                 }
             }
         }

@@ -111,6 +111,15 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
     }
 }
 
+/// What has come.
+#[derive(Debug)]
+pub enum Heard {
+    /// A message.
+    Message(Message),
+    /// The first part of a payload of so many bytes: the rest is on its way.
+    Claim(usize),
+}
+
 /// The half that receives.
 #[derive(Debug)]
 pub struct Reader<R> {
@@ -128,20 +137,43 @@ impl<R: AsyncRead + Unpin> Reader<R> {
     ///
     /// Cancel safe: what has arrived is kept for the next call.
     pub async fn recv(&mut self) -> Result<Option<Message>, LinkError> {
-        self.next(None).await
+        self.next_message(None).await
     }
 
     /// As [`Reader::recv`], but fails with [`LinkError::Silent`] when not one byte has come
     /// for so long, cancelled calls included. A long message that trickles in is not
     /// silence.
     pub async fn recv_within(&mut self, silence: Duration) -> Result<Option<Message>, LinkError> {
+        self.next_message(Some(silence)).await
+    }
+
+    /// As [`Reader::recv_within`], but says when a long payload begins, before more than a
+    /// few parts of it are taken: a receiver with little memory calls again when it has some.
+    /// Until then the sender is held back.
+    pub async fn recv_or_claim(&mut self, silence: Duration) -> Result<Option<Heard>, LinkError> {
         self.next(Some(silence)).await
     }
 
-    async fn next(&mut self, silence: Option<Duration>) -> Result<Option<Message>, LinkError> {
+    async fn next_message(
+        &mut self,
+        silence: Option<Duration>,
+    ) -> Result<Option<Message>, LinkError> {
+        loop {
+            match self.next(silence).await? {
+                Some(Heard::Message(message)) => return Ok(Some(message)),
+                Some(Heard::Claim(_)) => {}
+                None => return Ok(None),
+            }
+        }
+    }
+
+    async fn next(&mut self, silence: Option<Duration>) -> Result<Option<Heard>, LinkError> {
         loop {
             if let Some(message) = self.decoder.decode(&mut self.buffer)? {
-                return Ok(Some(message));
+                return Ok(Some(Heard::Message(message)));
+            }
+            if let Some(bytes) = self.decoder.take_claim() {
+                return Ok(Some(Heard::Claim(bytes)));
             }
             let arrived = match &mut self.secure {
                 None => &mut self.buffer,
