@@ -154,24 +154,26 @@ pub async fn serve(
     }
     // Workers are the scheduler's to watch, which probes them. A client pings by itself;
     // one that is silent for so long is gone, and its shots hold the farm for nobody.
-    let patience = admission.silence * CLIENT_PATIENCE;
+    let patience = (!is_worker).then_some(admission.silence * CLIENT_PATIENCE);
     let mut leaving = false;
     let how = loop {
         tokio::select! {
             () = hang_up.cancelled() => break Ok(()),
-            received = async {
-                if is_worker { reader.recv().await } else { reader.recv_within(patience).await }
-            } => match received {
-                Ok(Some(message)) => {
-                    leaving |= matches!(message, Message::Goodbye(_));
-                    let event = ToDriver::Event(peer, PeerEvent::Said(message));
-                    if admission.events.send(event).await.is_err() {
-                        break Ok(());
+            heard = reader.hear(patience) => {
+                let event = match heard {
+                    Ok(Heard::Message(message)) => {
+                        leaving |= matches!(message, Message::Goodbye(_));
+                        PeerEvent::Said(message)
                     }
+                    Ok(Heard::More) if is_worker => PeerEvent::Stirred,
+                    Ok(Heard::More | Heard::Claim(_)) => continue,
+                    Ok(Heard::End) => break Ok(()),
+                    Err(why) => break Err(why),
+                };
+                if admission.events.send(ToDriver::Event(peer, event)).await.is_err() {
+                    break Ok(());
                 }
-                Ok(None) => break Ok(()),
-                Err(why) => break Err(why),
-            },
+            }
         }
     };
     let (reason, text) = match how {
@@ -219,10 +221,11 @@ async fn desk(connection: Connection<TcpStream>, admission: &Admission) {
         let received = tokio::select! {
             () = admission.stop.cancelled() => return,
             () = sleep_until(due) => return,
-            received = reader.recv_or_claim(patience) => received,
+            received = reader.hear(Some(patience)) => received,
         };
         let (answer, _claim): (Message, _) = match received {
-            Ok(Some(Heard::Claim(bytes))) => {
+            Ok(Heard::More) => continue,
+            Ok(Heard::Claim(bytes)) => {
                 let claim = tokio::select! {
                     () = admission.stop.cancelled() => return,
                     claim = admission.api.claim(bytes) => claim,
@@ -232,14 +235,12 @@ async fn desk(connection: Connection<TcpStream>, admission: &Admission) {
                 (share, due) = (Some(claim), Some(Instant::now() + BODY_LIMIT));
                 continue;
             }
-            Ok(Some(Heard::Message(Message::Request(request)))) => {
+            Ok(Heard::Message(Message::Request(request))) => {
                 due = None;
                 let (response, claim) = admission.api.answer(request, share.take()).await;
                 (response.into(), claim)
             }
-            Ok(Some(Heard::Message(Message::Ping(ping)))) => {
-                (Pong { number: ping.number }.into(), None)
-            }
+            Ok(Heard::Message(Message::Ping(ping))) => (Pong { number: ping.number }.into(), None),
             _ => return,
         };
         match tokio::time::timeout(ANSWER_LIMIT, writer.send(&answer)).await {

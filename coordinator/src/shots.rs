@@ -92,6 +92,7 @@ impl Shot {
             split: self.submit.split,
             priority: self.submit.priority,
             frames_in_flight: self.submit.frames_in_flight,
+            live: self.submit.live,
         }
     }
 }

@@ -85,6 +85,7 @@ fn submission(frames: u32) -> Submit {
         frames,
         frames_in_flight: 2,
         priority: 0,
+        live: false,
     }
 }
 
@@ -297,6 +298,7 @@ fn a_shot_that_needs_too_much_memory_is_rejected_with_advice() {
         frames: 1000,
         frames_in_flight: 1000,
         priority: 0,
+        live: false,
     };
     let out = bench.say(Peer::Client(CLIENT), submit);
     let [Out::Send(_, Message::Rejected(rejected))] = &out[..] else { panic!("{out:?}") };

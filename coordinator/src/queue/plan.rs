@@ -184,6 +184,8 @@ impl ShotPlan {
             frames,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
+            // What is left overnight has nobody who waits for each frame.
+            live: false,
         }
     }
 }
