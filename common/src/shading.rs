@@ -10,8 +10,9 @@ use serde::{Deserialize, Serialize};
 pub type LinearRgb = [f32; 3];
 
 /// Everything about a picture that is neither terrain nor camera. Plain values; it
-/// travels to the workers as it is.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// travels to the workers as it is. By default the photo is shown as it is, on a flat Earth
+/// under a clear sky.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Shading {
     /// Direct light; without it the photo is shown as it is.
     pub sun: Option<Sun>,

@@ -31,7 +31,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_raycast::{Pyramid, View, cast};
 
 /// Share of posts about which the bilinear surface and GRASS may differ, over all
@@ -132,14 +132,7 @@ fn sees(
         width: 1,
         height: 1,
     };
-    let shading = Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth: None,
-        below_ground: [0.0; 3],
-        bare_ground: None,
-    };
+    let shading = Shading::default();
     let view = View { camera, shading, quality: Quality::default() };
     let hit = cast(resident, pyramid, &view, 0.5, 0.5).unwrap();
     hit.is_none_or(|hit| hit.distance_m >= way.length() * (1.0 - AT_POST))

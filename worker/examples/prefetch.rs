@@ -5,8 +5,10 @@
 //! `cargo run --release -p terrafarm-worker --example prefetch [MB/s]`
 
 use glam::DVec3;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
+use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
@@ -14,9 +16,9 @@ use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky, Sun};
-use terrafarm_terrain::codec::encode_heights;
-use terrafarm_terrain::layout::*;
-use terrafarm_terrain::store::hash_of;
+use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
+use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Trust, accept, outbox};
 use terrafarm_wire::message::{Ahead, Blob, Grant, OpenShot, Timesheet};
@@ -33,60 +35,42 @@ const POSTS: u64 = 4097;
 const SPACING_M: f64 = 10.0;
 const SHOT: ShotId = ShotId(1);
 
-struct Land {
-    index: BlobHash,
-    blobs: BTreeMap<BlobHash, Vec<u8>>,
+struct Hills;
+
+impl LayerSource for Hills {
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        let fold = |v: u64, period: u64| (v % (2 * period)).abs_diff(period) as f32;
+        window.fill(into, |x, y| {
+            let rough = ((x * 7919 + y * 104_729) % 97) as f32 / 60.0;
+            fold(x, 190) * fold(y, 230) / 90.0 + fold(x + y, 41) * 0.8 + rough
+        });
+        Ok(())
+    }
 }
 
-fn height(x: i64, y: i64) -> f32 {
-    let fold = |v: i64, period: i64| (v.rem_euclid(2 * period) - period).abs() as f32;
-    let rough = ((x * 7919 + y * 104_729) % 97) as f32 / 60.0;
-    fold(x, 190) * fold(y, 230) / 90.0 + fold(x + y, 41) * 0.8 + rough
-}
-
-fn land() -> Land {
-    let mut blobs = BTreeMap::new();
-    let mut layer = Layer {
+fn land(folder: &Path) -> StoreReader {
+    let path = folder.join("hills.terrain");
+    let spec = LayerSpec {
         kind: LayerKind::Height,
         origin: [0.0; 2],
         spacing: [SPACING_M; 2],
         posts: [POSTS; 2],
-        levels: Vec::new(),
+        quantum_m: None,
     };
-    for level in 0..Layer::level_count(layer.posts) {
-        let tiles = Layer::tiles_for(layer.level_posts(level));
-        let places = (0..tiles[1]).flat_map(|ty| (0..tiles[0]).map(move |tx| (tx, ty)));
-        let entries = places.map(|place| tile(level, place, &mut blobs)).collect();
-        layer.levels.push(Level { tiles, entries });
-    }
-    let index = StoreIndex {
-        version: STORE_VERSION,
-        crs: "LOCAL".to_owned(),
-        height_datum: HeightDatum::Unknown,
-        earth_radius_m: None,
-        layers: vec![layer],
-        report: ImportReport::default(),
-    };
-    let bytes = postcard::to_stdvec(&index).expect("an index");
-    let hash = hash_of(&bytes);
-    blobs.insert(hash, bytes);
-    Land { index: hash, blobs }
+    let mut builder =
+        StoreBuilder::create(&path, "LOCAL", HeightDatum::Unknown, None).expect("a file");
+    builder.add_layer(spec, &Hills, &|_, _| (), &AtomicBool::new(false)).expect("heights");
+    builder.finish(ImportReport::default()).expect("a store");
+    StoreReader::open(&path).expect("a store")
 }
 
-fn tile(level: usize, (tx, ty): (u32, u32), blobs: &mut BTreeMap<BlobHash, Vec<u8>>) -> TileEntry {
-    let side = TILE_POSTS as i64;
-    let last = POSTS as i64 - 1;
-    let post = |at: i64| {
-        let (i, j) = (at % side - 1 + i64::from(tx) * 256, at / side - 1 + i64::from(ty) * 256);
-        height((i << level).clamp(0, last), (j << level).clamp(0, last))
-    };
-    let posts: Vec<f32> = (0..side * side).map(post).collect();
-    let bytes = encode_heights(&posts, None);
-    let hash = hash_of(&bytes);
-    let length = bytes.len() as u32;
-    blobs.insert(hash, bytes);
-    let deviation = if level == 0 { 0.0 } else { 6.0 * level as f32 };
-    TileEntry { hash, offset: 4096, length, min: 0.0, max: 600.0, deviation }
+/// A blob of a store: its index or a tile.
+fn blob(land: &StoreReader, hash: BlobHash) -> Vec<u8> {
+    let (index_hash, index) = land.index_blob();
+    match hash == index_hash {
+        true => index.to_vec(),
+        false => land.read_blob(&hash).expect("a tile of the store"),
+    }
 }
 
 fn camera(frame: u32) -> Camera {
@@ -96,7 +80,12 @@ fn camera(frame: u32) -> Camera {
 }
 
 /// A worker's time on the first frame and on all others, and the bytes of terrain that it was sent.
-async fn fly(land: Arc<Land>, bytes_per_s: f64, told: bool, memory: u64) -> ([Timesheet; 2], u64) {
+async fn fly(
+    land: Arc<StoreReader>,
+    bytes_per_s: f64,
+    told: bool,
+    memory: u64,
+) -> ([Timesheet; 2], u64) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a socket");
     let folder = tempfile::tempdir().expect("a folder");
     let config = WorkerConfig {
@@ -129,7 +118,7 @@ async fn fly(land: Arc<Land>, bytes_per_s: f64, told: bool, memory: u64) -> ([Ti
         let mut sent = 0;
         let mut free_at = Instant::now();
         while let Some(hash) = questions.recv().await {
-            let bytes = source.blobs[&hash].clone();
+            let bytes = blob(&source, hash);
             sent += bytes.len() as u64;
             // The link is busy for as long as the blob takes.
             free_at = free_at.max(Instant::now())
@@ -153,7 +142,7 @@ async fn fly(land: Arc<Land>, bytes_per_s: f64, told: bool, memory: u64) -> ([Ti
     let (width, height) = SIZE;
     let open = OpenShot {
         shot: SHOT,
-        index: land.index,
+        index: land.index_blob().0,
         shading,
         quality,
         check: Share::NONE,
@@ -218,12 +207,11 @@ async fn main() {
     let megabytes: Vec<f64> = std::env::args().skip(1).filter_map(|arg| arg.parse().ok()).collect();
     let megabytes = if megabytes.is_empty() { vec![1.0, 2.0, 4.0, 16.0] } else { megabytes };
     let began = Instant::now();
-    let land = Arc::new(land());
-    let bytes: usize = land.blobs.values().map(Vec::len).sum();
+    let folder = tempfile::tempdir().expect("a folder");
+    let land = Arc::new(land(folder.path()));
     println!(
-        "{} blobs, {:.1} MB, made in {:.1} s; {FRAMES} frames of {} x {}",
-        land.blobs.len(),
-        bytes as f64 / 1e6,
+        "{:.1} MB of terrain, made in {:.1} s; {FRAMES} frames of {} x {}",
+        land.file_bytes() as f64 / 1e6,
         began.elapsed().as_secs_f64(),
         SIZE.0,
         SIZE.1

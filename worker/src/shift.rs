@@ -158,6 +158,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                 heard = reader.hear(Some(self.silence)) => match heard {
                     Ok(Heard::Message(message)) => self.received(message, &outbox),
                     Ok(Heard::More) => self.speak_up(&outbox).map(|()| None),
+                    Ok(Heard::Claim(_)) => Ok(None),
                     Ok(Heard::End) => Err(LinkError::Closed),
                     Err(lost) => Err(lost),
                 },

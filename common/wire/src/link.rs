@@ -122,6 +122,8 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
 pub enum Heard {
     /// A message.
     Message(Message),
+    /// The first part of a payload of so many bytes: the rest is on its way.
+    Claim(usize),
     /// More of a message that is not whole yet: the peer lives.
     More,
     /// The end: the peer has closed between two messages.
@@ -147,33 +149,43 @@ impl<R: AsyncRead + Unpin> Reader<R> {
     ///
     /// Cancel safe: what has arrived is kept for the next call.
     pub async fn recv(&mut self) -> Result<Option<Message>, LinkError> {
-        Ok(self.next(None, None).await?.message())
+        self.next_message(None).await
     }
 
     /// As [`Reader::recv`], but fails with [`LinkError::Silent`] when not one byte has come
     /// for so long, cancelled calls included. A long message that trickles in is not
     /// silence.
     pub async fn recv_within(&mut self, silence: Duration) -> Result<Option<Message>, LinkError> {
-        Ok(self.next(Some(silence), None).await?.message())
+        self.next_message(Some(silence)).await
     }
 
-    /// As [`Reader::recv_within`] where there is a limit, else as [`Reader::recv`]; but while
-    /// a message comes for longer than [`WHILE_IT_COMES`], says so after each such time in
-    /// which bytes of it came.
-    pub async fn hear(&mut self, silence: Option<Duration>) -> Result<Heard, LinkError> {
-        self.next(silence, Some(WHILE_IT_COMES)).await
-    }
-
-    async fn next(
+    async fn next_message(
         &mut self,
         silence: Option<Duration>,
-        telling: Option<Duration>,
-    ) -> Result<Heard, LinkError> {
+    ) -> Result<Option<Message>, LinkError> {
+        loop {
+            match self.hear(silence).await? {
+                Heard::Message(message) => return Ok(Some(message)),
+                Heard::Claim(_) | Heard::More => {}
+                Heard::End => return Ok(None),
+            }
+        }
+    }
+
+    /// As [`Reader::recv_within`] where there is a limit, else as [`Reader::recv`]; but says
+    /// when a long payload begins, before more than a few parts of it are taken: a receiver
+    /// with little memory calls again when it has some, and until then the sender is held
+    /// back. And while a message comes for longer than [`WHILE_IT_COMES`], it says so after
+    /// each such time in which bytes of it came.
+    pub async fn hear(&mut self, silence: Option<Duration>) -> Result<Heard, LinkError> {
         let mut has_read = false;
         loop {
             if let Some(message) = self.decoder.decode(&mut self.buffer)? {
                 self.told = None;
                 return Ok(Heard::Message(message));
+            }
+            if let Some(bytes) = self.decoder.take_claim() {
+                return Ok(Heard::Claim(bytes));
             }
             let arrived = match &mut self.secure {
                 None => &mut self.buffer,
@@ -187,7 +199,7 @@ impl<R: AsyncRead + Unpin> Reader<R> {
             };
             if std::mem::take(&mut has_read) {
                 let told = *self.told.get_or_insert(self.heard);
-                if telling.is_some_and(|every| self.heard - told >= every) {
+                if self.heard - told >= WHILE_IT_COMES {
                     self.told = Some(self.heard);
                     return Ok(Heard::More);
                 }
@@ -207,16 +219,6 @@ impl<R: AsyncRead + Unpin> Reader<R> {
             }
             self.heard = Instant::now();
             has_read = true;
-        }
-    }
-}
-
-impl Heard {
-    /// The message, if there is one.
-    fn message(self) -> Option<Message> {
-        match self {
-            Heard::Message(message) => Some(message),
-            Heard::More | Heard::End => None,
         }
     }
 }

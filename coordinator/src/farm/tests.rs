@@ -10,7 +10,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::BlobHash;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::message::{
     Blob, Cameras, Done, Failed, HandBack, RenderReport, Submit, Timesheet, WantBlobs,
@@ -90,14 +90,7 @@ fn submission(frames: u32) -> Submit {
 }
 
 fn shading() -> Shading {
-    Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth: None,
-        below_ground: [0.0; 3],
-        bare_ground: None,
-    }
+    Shading::default()
 }
 
 fn worker(number: u64) -> Peer {

@@ -6,7 +6,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::BlobHash;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_coordinator::queue::{Film, ShotPlan, Source};
 
 /// The variable that names the folder to write seeds into.
@@ -42,14 +42,7 @@ pub fn submission() -> String {
         name: "hills".to_owned(),
         priority: 0,
         index: BlobHash([7; 32]),
-        shading: Shading {
-            sun: None,
-            haze: None,
-            sky: Sky::default(),
-            earth: None,
-            below_ground: [0.0; 3],
-            bare_ground: None,
-        },
+        shading: Shading::default(),
         quality: Quality::default(),
         check: Share::NONE,
         size: [size.0, size.1],

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 
 /// Stores as files: one of a single tile, one with a photo and two levels.
 pub fn small() -> Vec<Vec<u8>> {
@@ -39,27 +39,12 @@ fn write(path: &Path, layers: &[LayerSpec]) {
 struct Ramp;
 
 impl LayerSource for Ramp {
-    fn heights(
-        &self,
-        i0: i64,
-        _: i64,
-        width: usize,
-        _: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        let posts = into.iter_mut().enumerate();
-        posts.for_each(|(at, post)| *post = (i0 as usize + at % width) as f32);
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        window.fill(into, |i, _| i as f32);
         Ok(())
     }
 
-    fn colors(
-        &self,
-        _: i64,
-        _: i64,
-        _: usize,
-        _: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
+    fn colors(&self, _: PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
         into.fill([90, 120, 60, 255]);
         Ok(())
     }

@@ -18,7 +18,7 @@ use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
-use terrafarm_common::shading::{Earth, Shading, Sky};
+use terrafarm_common::shading::{Earth, Shading};
 use terrafarm_terrain::resident::Resident;
 
 /// A store with its pyramid.
@@ -79,14 +79,7 @@ impl Land {
 
 /// No sun and no haze.
 pub(crate) fn bare(earth: Option<Earth>) -> Shading {
-    Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth,
-        below_ground: [0.5, 0.0, 0.5],
-        bare_ground: None,
-    }
+    Shading { earth, below_ground: [0.5, 0.0, 0.5], ..Shading::default() }
 }
 
 /// A number of rays or rounds, twenty times as many in the long form.

@@ -3,16 +3,9 @@
 //! A method says how far along the map the ray through a place of the picture meets the
 //! ground; all else follows from that here, for as many places at once as the processor
 //! has lanes. A place's colour depends on the place and its distance alone.
-//!
-//! Sunlight is shared out so that flat ground keeps the brightness that the photo gives
-//! it: with n the normal and l the direction of the sun,
-//!
-//! `light = 1 + strength (min(ambient + (1 - ambient) max(0, n.l) / max(l.z, 0.05), 2) - 1)`.
-//!
-//! On flat ground n.l = l.z and the light is 1, until the sun is within 3 degrees of the
-//! horizon; from there it fades to the ambient share, which is all there is at night.
 
 mod air;
+mod batch;
 mod exp;
 mod footprint;
 mod level;
@@ -20,32 +13,32 @@ mod photo;
 mod ray;
 mod sheets;
 mod slope;
+mod sun;
 #[cfg(test)]
 mod tests;
 mod tint;
 
 use crate::field::{Field, Wanted};
-use crate::lanes::{self, Floats, Kernel, Lanes, MOST, Mask, Width};
-use crate::{Pyramid, View, srgb};
+use crate::lanes::{self, Floats, Kernel, Lanes, Mask, Width};
+use crate::{Pyramid, View};
+pub(crate) use batch::{At, Far, Places};
+
 use air::Air;
+use batch::{AT_ONCE, Batch, Canvas};
 use footprint::{Footprint, steepness};
 use glam::DVec3;
-use photo::{Rows, Sums};
+use photo::Sums;
 use ray::{Lens, Ray};
 use sheets::Sheets;
-use slope::Cells;
 use std::collections::BTreeSet;
+use sun::Sunlight;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
-use terrafarm_common::shading::{LinearRgb, Shading, Sun};
+use terrafarm_common::shading::{LinearRgb, Shading};
 use terrafarm_terrain::layout::{LayerKind, TileKey};
 use terrafarm_terrain::resident::Resident;
 use terrafarm_terrain::tile::{HeightTile, PhotoTile};
 
-/// Sine of the sun's elevation below which flat ground grows dark: 2.9 degrees.
-const LOW_SUN_SINE: f64 = 0.05;
-/// The most light that a slope facing a low sun gets, flat ground being 1.
-const MAX_LIGHT: f64 = 2.0;
 /// Coverage from which on there is no bare ground to be seen.
 const COVERED: f32 = 1.0 - 1e-6;
 
@@ -96,48 +89,6 @@ pub fn shade(
     let mut missing = BTreeSet::new();
     shader.wanted.drain_into(&mut missing);
     missing.into_iter().collect()
-}
-
-/// Places of the picture, and how far away the ground is that is seen there.
-#[derive(Clone, Copy)]
-pub(crate) struct Places<'p> {
-    pub at: At<'p>,
-    pub far: Far<'p>,
-}
-
-/// Places of the picture, x and y, pixels from its top left corner.
-#[derive(Clone, Copy)]
-pub(crate) enum At<'p> {
-    /// One for each x, with the y of the same number.
-    Each(&'p [f32], &'p [f32]),
-    /// All of the columns at the first y, then all at the second, and so on.
-    Net(&'p [f32], &'p [f32]),
-}
-
-/// How far away the ground is.
-#[derive(Clone, Copy)]
-pub(crate) enum Far<'p> {
-    /// Metres along the map; infinite for the sky, NaN where a tile is missing. The way of
-    /// a ray that is steeper than one in a million counts as if it were that.
-    Map(&'p [f32]),
-    /// One over the depth, as [`crate::seen::Seen`] has it.
-    Inverse(&'p [f32]),
-}
-
-impl Far<'_> {
-    fn values(&self) -> &[f32] {
-        let (Far::Map(values) | Far::Inverse(values)) = self;
-        values
-    }
-}
-
-/// Sunlight on ground: `min(ambient + direct max(0, n.l), most)`.
-#[derive(Clone, Copy)]
-struct Sunlight {
-    direction: [f32; 3],
-    ambient: f32,
-    direct: f32,
-    most: f32,
 }
 
 impl<'a> Shader<'a> {
@@ -374,157 +325,6 @@ impl<'a> Shader<'a> {
     }
 }
 
-/// Places that are shaded at once; a multiple of all numbers of lanes.
-const AT_ONCE: usize = 128;
-/// Vectors of them, at most.
-const VECTORS: usize = AT_ONCE;
-
-/// Some places on their way from step to step. Masks are bits, one word a vector.
-struct Batch {
-    count: usize,
-    x: [f32; AT_ONCE],
-    y: [f32; AT_ONCE],
-    far: [f32; AT_ONCE],
-    /// It is one over the depth.
-    inverse: bool,
-    ground: [u32; VECTORS],
-    sky: [u32; VECTORS],
-    unsure: [u32; VECTORS],
-    view: [[f32; AT_ONCE]; 3],
-    along: [[f32; AT_ONCE]; 2],
-    over: [f32; AT_ONCE],
-    distance: [f32; AT_ONCE],
-    falls: [f32; AT_ONCE],
-    size: [f32; AT_ONCE],
-    slopes: [[f32; AT_ONCE]; 2],
-    steepness: [f32; AT_ONCE],
-    light: [[f32; AT_ONCE]; 3],
-    covered: [f32; AT_ONCE],
-    cells: Cells,
-    rows: Rows,
-}
-
-impl Batch {
-    fn new() -> Self {
-        let none = [0.0; AT_ONCE];
-        Batch {
-            count: 0,
-            x: none,
-            y: none,
-            far: none,
-            inverse: false,
-            ground: [0; VECTORS],
-            sky: [0; VECTORS],
-            unsure: [0; VECTORS],
-            view: [none; 3],
-            along: [none; 2],
-            over: none,
-            distance: none,
-            falls: none,
-            size: none,
-            slopes: [none; 2],
-            steepness: none,
-            light: [none; 3],
-            covered: none,
-            cells: Cells::new(),
-            rows: Rows::new(),
-        }
-    }
-
-    /// Takes the places from `at` on, as many as fit. Those that fill the last vector up
-    /// need nothing.
-    #[inline(always)]
-    fn fill(&mut self, places: Places, at: usize) {
-        let far = places.far.values();
-        self.count = AT_ONCE.min(far.len() - at);
-        self.inverse = matches!(places.far, Far::Inverse(_));
-        let end = at + self.count;
-        self.far[..self.count].copy_from_slice(&far[at..end]);
-        let last = (self.count + MOST).min(AT_ONCE);
-        self.far[self.count..last].fill(f32::NAN);
-        match places.at {
-            At::Each(x, y) => {
-                self.x[..self.count].copy_from_slice(&x[at..end]);
-                self.y[..self.count].copy_from_slice(&y[at..end]);
-            }
-            At::Net(x, y) => {
-                let mut filled = 0;
-                while filled < self.count {
-                    let (row, column) = ((at + filled) / x.len(), (at + filled) % x.len());
-                    let run = (x.len() - column).min(self.count - filled);
-                    self.x[filled..][..run].copy_from_slice(&x[column..][..run]);
-                    self.y[filled..][..run].fill(y[row]);
-                    filled += run;
-                }
-            }
-        }
-    }
-
-    /// The places of vector `n` of which it is not known what they show.
-    #[inline(always)]
-    fn unknown<L: Lanes>(&self, n: usize) -> u32 {
-        let filled = self.count - n * L::N;
-        let all = (1 << filled.min(L::N)) - 1;
-        all & !(self.sky[n] | (self.ground[n] & !self.unsure[n]))
-    }
-
-    #[inline(always)]
-    fn light<L: Lanes>(&self, at: usize) -> [L::F; 3] {
-        let [red, green, blue] = &self.light;
-        [L::F::load(&red[at..]), L::F::load(&green[at..]), L::F::load(&blue[at..])]
-    }
-
-    #[inline(always)]
-    fn view<L: Lanes>(&self, at: usize) -> [L::F; 3] {
-        let [x, y, z] = &self.view;
-        [L::F::load(&x[at..]), L::F::load(&y[at..]), L::F::load(&z[at..])]
-    }
-
-    #[inline(always)]
-    fn along<L: Lanes>(&self, at: usize) -> [L::F; 2] {
-        [L::F::load(&self.along[0][at..]), L::F::load(&self.along[1][at..])]
-    }
-
-    #[inline(always)]
-    fn slopes<L: Lanes>(&self, at: usize) -> [L::F; 2] {
-        [L::F::load(&self.slopes[0][at..]), L::F::load(&self.slopes[1][at..])]
-    }
-}
-
-/// Where the light goes.
-enum Canvas<'p> {
-    /// Red, green and blue.
-    Light([&'p mut [f32]; 3]),
-    /// Three bytes a place, and the numbers of the places for which a tile is missing.
-    Bytes(&'p mut [u8], &'p mut Vec<usize>),
-}
-
-impl Canvas<'_> {
-    /// Takes the light of a batch, whose first place has the number `at`.
-    #[inline(always)]
-    fn take<L: Lanes>(&mut self, batch: &Batch, at: usize) {
-        let count = batch.count;
-        match self {
-            Canvas::Light(light) => {
-                for c in 0..3 {
-                    light[c][at..at + count].copy_from_slice(&batch.light[c][..count]);
-                }
-            }
-            Canvas::Bytes(pixels, unknown) => {
-                let pixels = &mut pixels[3 * at..3 * (at + count)];
-                for (n, pixels) in pixels.chunks_mut(3 * L::N).enumerate() {
-                    srgb::store::<L>(batch.light::<L>(n * L::N), pixels);
-                    let mut left = batch.unknown::<L>(n);
-                    while left != 0 {
-                        unknown.push(at + n * L::N + left.trailing_zeros() as usize);
-                        left &= left - 1;
-                    }
-                }
-            }
-        }
-    }
-}
-
 /// A run of [`Shader::shade`] or [`Shader::paint`].
 struct Run<'s, 'a, 'p> {
     shader: &'s mut Shader<'a>,
@@ -546,30 +346,5 @@ impl Kernel for Run<'_, '_, '_> {
             canvas.take::<L>(&batch, at);
             at += batch.count;
         }
-    }
-}
-
-impl Sunlight {
-    fn new(sun: &Sun) -> Self {
-        let (ambient, strength) = (f64::from(sun.ambient), f64::from(sun.strength));
-        let z = sun.direction.z;
-        let direct = if z > 0.0 { (1.0 - ambient) / z.max(LOW_SUN_SINE) } else { 0.0 };
-        let of = |share: f64| (1.0 + strength * (share - 1.0)) as f32;
-        Sunlight {
-            direction: sun.direction.as_vec3().to_array(),
-            ambient: of(ambient),
-            direct: (strength * direct) as f32,
-            most: of(MAX_LIGHT),
-        }
-    }
-
-    /// Light on ground of the given slopes; see the module's page.
-    #[inline(always)]
-    fn light<L: Lanes>(&self, slopes: [L::F; 2], steepness: L::F) -> L::F {
-        let [x, y, z] = self.direction;
-        let facing = L::F::splat(z) - slopes[0] * L::F::splat(x) - slopes[1] * L::F::splat(y);
-        let facing = facing.max(L::F::splat(0.0)).div(steepness);
-        let light = L::F::splat(self.ambient) + L::F::splat(self.direct) * facing;
-        light.min(L::F::splat(self.most))
     }
 }

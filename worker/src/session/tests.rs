@@ -9,7 +9,7 @@ use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_wire::message::{
     Ahead, CloseShot, Drain, RenderReport, Revoke, Timesheet, WantBlobs,
 };
@@ -22,14 +22,7 @@ fn tile(number: u8) -> BlobHash {
 }
 
 fn open(shot: u64) -> Event {
-    let shading = Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth: None,
-        below_ground: [0.0; 3],
-        bare_ground: None,
-    };
+    let shading = Shading::default();
     let (quality, check) = (Quality::default(), Share::NONE);
     let shot = ShotId(shot);
     Event::Received(

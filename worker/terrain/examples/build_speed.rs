@@ -5,25 +5,18 @@
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 
 struct Ground;
 
 impl LayerSource for Ground {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        for (at, height) in into.iter_mut().enumerate() {
-            let (i, j) = (i0 + (at % width) as i64, j0 + (at / width) as i64);
-            let mixed = (i as u64 ^ (j as u64) << 32).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61;
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        window.fill(into, |i, j| {
+            let mixed = (i ^ j << 32).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61;
+            let (i, j) = (i as i64, j as i64);
             let wave = |n: i64, length: i64| (n % length - length / 2).abs() * 4;
-            *height = (wave(i + j / 3, 700) + wave(j - i / 2, 410)) as f32 + mixed as f32;
-        }
+            (wave(i + j / 3, 700) + wave(j - i / 2, 410)) as f32 + mixed as f32
+        });
         Ok(())
     }
 }

@@ -9,8 +9,8 @@
 use self::levels::Made;
 use crate::codec::{CodecError, MAX_TILE_BYTES};
 use crate::layout::{
-    HeightDatum, ImportReport, Layer, LayerKind, MAX_LAYERS, MAX_POSTS, MAX_TILES, STORE_VERSION,
-    StoreIndex, TileEntry,
+    HeightDatum, ImportReport, Layer, LayerKind, MAX_LAYERS, MAX_POSTS, MAX_TILES, PostWindow,
+    STORE_VERSION, StoreIndex, TileEntry,
 };
 use crate::positioned::write_all_at;
 use crate::pyramid::Post;
@@ -27,20 +27,13 @@ pub type SourceError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Where the posts of a layer come from. Called from several threads at once.
 pub trait LayerSource: Sync {
-    /// Heights of the posts (i0, j0) to (i0 + width − 1, j0 + height − 1), metres, row
-    /// by row from the south-west; NaN for a void. The window lies within the layer.
+    /// Heights of a window of posts, metres, row by row from the south-west; NaN for a
+    /// void. The window lies within the layer.
     ///
     /// # Errors
     /// Whatever keeps the source from answering; building stops.
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        let _ = (i0, j0, width, height, into);
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        let _ = (window, into);
         Err("this source has no heights".into())
     }
 
@@ -48,15 +41,8 @@ pub trait LayerSource: Sync {
     ///
     /// # Errors
     /// Whatever keeps the source from answering; building stops.
-    fn colors(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
-        let _ = (i0, j0, width, height, into);
+    fn colors(&self, window: PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
+        let _ = (window, into);
         Err("this source has no colours".into())
     }
 }

@@ -1,7 +1,7 @@
 //! Stores for tests, from rules of column and row.
 
 use crate::build::{BuildError, LayerSource, LayerSpec, SourceError, StoreBuilder, StoreSummary};
-use crate::layout::{HeightDatum, ImportReport, LayerKind};
+use crate::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -30,35 +30,17 @@ enum Rule {
 }
 
 impl LayerSource for Rule {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
         let Rule::Heights(rule) = self else { return Err("colours".into()) };
-        assert_eq!(into.len(), width * height);
-        for (at, post) in into.iter_mut().enumerate() {
-            *post = rule(i0 as u64 + (at % width) as u64, j0 as u64 + (at / width) as u64);
-        }
+        assert_eq!(into.len(), window.area());
+        window.fill(into, rule);
         Ok(())
     }
 
-    fn colors(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
+    fn colors(&self, window: PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
         let Rule::Colors(rule) = self else { return Err("heights".into()) };
-        assert_eq!(into.len(), width * height);
-        for (at, post) in into.iter_mut().enumerate() {
-            *post = rule(i0 as u64 + (at % width) as u64, j0 as u64 + (at / width) as u64);
-        }
+        assert_eq!(into.len(), window.area());
+        window.fill(into, rule);
         Ok(())
     }
 }

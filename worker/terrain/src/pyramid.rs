@@ -47,6 +47,15 @@ impl PostWindow {
         PostWindow::clipped(first, first.map(|post| post + TILE_POSTS as i64 - 1), posts)
     }
 
+    /// Fills a buffer of the window with a function of column and row.
+    pub fn fill<T>(&self, into: &mut [T], post: impl Fn(u64, u64) -> T) {
+        for (row, j) in into.chunks_exact_mut(self.width.max(1)).zip(self.j0..) {
+            for (place, i) in row.iter_mut().zip(self.i0..) {
+                *place = post(i, j);
+            }
+        }
+    }
+
     pub(crate) fn area(&self) -> usize {
         self.width * self.height
     }
@@ -105,7 +114,7 @@ impl Post for f32 {
     }
 
     fn read(source: &dyn LayerSource, w: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
-        source.heights(w.i0 as i64, w.j0 as i64, w.width, w.height, into)
+        source.heights(w, into)
     }
 
     fn encode(posts: &[f32], step_m: Option<f64>) -> Vec<u8> {
@@ -175,7 +184,7 @@ impl Post for [u8; 4] {
         w: PostWindow,
         into: &mut [[u8; 4]],
     ) -> Result<(), SourceError> {
-        source.colors(w.i0 as i64, w.j0 as i64, w.width, w.height, into)
+        source.colors(w, into)
     }
 
     fn encode(posts: &[[u8; 4]], _step_m: Option<f64>) -> Vec<u8> {

@@ -275,6 +275,7 @@ async fn a_long_message_is_heard_of_while_it_comes(token: Token) {
         heard_at = tokio::time::Instant::now();
         match heard {
             Heard::More => more += 1,
+            Heard::Claim(_) => {}
             Heard::Message(message) => {
                 assert_eq!(message, tile);
                 break;

@@ -21,7 +21,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::flight::Pose;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
-use terrafarm_common::shading::{Earth, Shading, Sky};
+use terrafarm_common::shading::{Earth, Shading};
 use terrafarm_raycast::View;
 
 /// Keyframes that a flight may have to be benched.
@@ -210,14 +210,7 @@ fn alternate(
 }
 
 fn view(camera: Camera, earth: Option<Earth>, method: Method, tolerance_px: f64) -> View {
-    let shading = Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth,
-        below_ground: [0.0; 3],
-        bare_ground: None,
-    };
+    let shading = Shading { earth, ..Shading::default() };
     View { camera, shading, quality: Quality { method, samples_per_side: 1, tolerance_px } }
 }
 

@@ -16,7 +16,8 @@ use terrafarm_raycast::Pyramid;
 use terrafarm_synth::SynthSpec;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
 use terrafarm_terrain::layout::{
-    HeightDatum, ImportReport, Layer, LayerKind, Level, StoreIndex, TILE_CELLS, TileEntry, TileKey,
+    HeightDatum, ImportReport, Layer, LayerKind, Level, PostWindow, StoreIndex, TILE_CELLS,
+    TileEntry, TileKey,
 };
 use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::sample::Sampler;
@@ -59,19 +60,8 @@ pub enum Load {
 pub struct Rule<F>(pub F);
 
 impl<F: Fn(u64, u64) -> f32 + Sync> LayerSource for Rule<F> {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        for (row, j) in into.chunks_exact_mut(width).zip(j0 as u64..) {
-            for (post, i) in row.iter_mut().zip(i0 as u64..) {
-                *post = self.0(i, j);
-            }
-        }
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        window.fill(into, &self.0);
         Ok(())
     }
 }
@@ -80,20 +70,11 @@ impl<F: Fn(u64, u64) -> f32 + Sync> LayerSource for Rule<F> {
 pub struct Paint<F>(pub F);
 
 impl<F: Fn(u64, u64) -> [u8; 3] + Sync> LayerSource for Paint<F> {
-    fn colors(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
-        for (row, j) in into.chunks_exact_mut(width).zip(j0 as u64..) {
-            for (pixel, i) in row.iter_mut().zip(i0 as u64..) {
-                let [r, g, b] = self.0(i, j);
-                *pixel = [r, g, b, 255];
-            }
-        }
+    fn colors(&self, window: PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
+        window.fill(into, |i, j| {
+            let [r, g, b] = self.0(i, j);
+            [r, g, b, 255]
+        });
         Ok(())
     }
 }

@@ -15,13 +15,14 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::WorkerId;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::Message;
 use terrafarm_wire::message::{Done, Grant, RenderReport, Timesheet, WantBlobs};
 use terrafarm_wire::pixels::Pixels;
+use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 
 /// How long anything may take before a test gives up on it.
@@ -56,8 +57,12 @@ impl House {
     }
 
     pub async fn with(config: QueueConfig) -> Self {
+        Self::with_farm(config, Config::default()).await
+    }
+
+    pub async fn with_farm(config: QueueConfig, farm: Config) -> Self {
         let stop = CancellationToken::new();
-        let line = FarmLine::to_new_farm(Config::default(), stop.clone());
+        let line = FarmLine::to_new_farm(farm, stop.clone());
         let deadline = Instant::now() + PATIENCE;
         let (queue, task) = loop {
             match Queue::open(config.clone(), line.clone()).await {
@@ -95,6 +100,12 @@ impl House {
         tokio::spawn(work(self.line.clone(), worker, jobs, self.log.clone()))
     }
 
+    /// A worker all of whose pixels are wrong; it answers a grant for each permit.
+    pub async fn hire_liar(&self, worker: WorkerId, permits: Arc<Semaphore>) -> JoinHandle<()> {
+        let (line, log) = (self.line.clone(), self.log.clone());
+        tokio::spawn(paint(line, worker, log, permits, 1))
+    }
+
     /// The numbers of the frames that were rendered, in order.
     pub fn rendered(&self) -> Vec<FrameIndex> {
         self.log.lock().unwrap().iter().map(|(_, frame)| *frame).collect()
@@ -119,9 +130,15 @@ impl House {
 /// Renders: asks for the whole terrain of a shot, then answers grants by their camera's
 /// position.
 pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
+    let permits = Arc::new(Semaphore::new(jobs.min(Semaphore::MAX_PERMITS)));
+    paint(line, worker, log, permits, 0).await;
+}
+
+/// As [`work`], a grant for each permit, in another colour.
+async fn paint(line: FarmLine, worker: WorkerId, log: Log, permits: Arc<Semaphore>, fault: u8) {
     let mut end = line.hire(worker).await;
     let (mut wanted, mut waiting) = (Vec::new(), Vec::<Grant>::new());
-    let (mut index_of, mut answered) = (HashMap::new(), 0);
+    let mut index_of = HashMap::new();
     while let Some(message) = end.recv().await {
         match message {
             Message::OpenShot(open) => {
@@ -156,21 +173,18 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
         }
         while wanted.is_empty() && !waiting.is_empty() {
             let grant = waiting.remove(0);
-            if answered >= jobs {
-                std::future::pending::<()>().await;
-            }
-            answered += 1;
+            permits.acquire().await.unwrap().forget();
             let number = grant.camera.position.x as FrameIndex;
             log.lock().unwrap().push((grant.shot, number));
-            if !line.work(worker, done(&grant, number)).await {
+            if !line.work(worker, done(&grant, number, fault)).await {
                 return;
             }
         }
     }
 }
 
-fn done(grant: &Grant, number: FrameIndex) -> Done {
-    let pixels = vec![number as u8; grant.region.area() as usize * 3];
+fn done(grant: &Grant, number: FrameIndex, fault: u8) -> Done {
+    let pixels = vec![number as u8 ^ fault; grant.region.area() as usize * 3];
     let report = RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
     let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
     let timesheet = Timesheet::default();
@@ -187,14 +201,7 @@ pub fn plan(land: &Land, frames: u32) -> ShotPlan {
         name: "hills".into(),
         priority: 0,
         index: land.index,
-        shading: Shading {
-            sun: None,
-            haze: None,
-            sky: Sky::default(),
-            earth: None,
-            below_ground: [0.0; 3],
-            bare_ground: None,
-        },
+        shading: Shading::default(),
         quality: Quality::default(),
         check: Share::NONE,
         size: [SIZE.0, SIZE.1],
@@ -217,17 +224,8 @@ pub struct Land {
 struct Slope;
 
 impl LayerSource for Slope {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        for (at, post) in into.iter_mut().enumerate() {
-            *post = (i0 as usize + at % width + 3 * (j0 as usize + at / width)) as f32;
-        }
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        window.fill(into, |i, j| (i + 3 * j) as f32);
         Ok(())
     }
 }

@@ -13,10 +13,10 @@
 //! chain of roots and quotients, and reading it is a loop of a length that the processor
 //! cannot foresee. One after the other for each place, either would wait for the other.
 
+use super::batch::{AT_ONCE, VECTORS};
 use super::footprint::{Footprint, Strip};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
-use super::{AT_ONCE, VECTORS};
 use crate::field::Wanted;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
 use terrafarm_terrain::layout::{TILE_POSTS, TILE_RING};

@@ -6,9 +6,9 @@
 //!
 //! Step by step for some places at once, as in `photo`.
 
+use super::batch::{AT_ONCE, VECTORS};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
-use super::{AT_ONCE, VECTORS};
 use crate::field::Wanted;
 use crate::lanes::as_bits;
 use crate::lanes::{Floats, Ints, Lanes, Mask};

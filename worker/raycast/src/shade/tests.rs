@@ -5,7 +5,7 @@ use crate::lanes::One;
 use crate::path::{Ground, Path};
 use crate::tests_support::{Plan, keys, mountains, noise, resident, store};
 use glam::DVec2;
-use terrafarm_common::shading::{Earth, Haze, Sky};
+use terrafarm_common::shading::{Earth, Haze, Sky, Sun};
 use terrafarm_terrain::layout::{Layer, TILE_CELLS};
 use terrafarm_terrain::resident::Lookup;
 

@@ -1,6 +1,6 @@
 //! Regular grids: an affine frame of samples anywhere, and the store's own posts.
 
-use terrafarm_terrain::layout::{Layer, MAX_POSTS, MAX_TILES};
+use terrafarm_terrain::layout::{self, Layer, MAX_POSTS, MAX_TILES};
 
 /// A frame in which positions are counted in columns and rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -142,6 +142,13 @@ impl Grid {
             spacing: self.spacing,
             posts: self.posts.map(|n| n + 2 * by),
         }
+    }
+}
+
+impl From<layout::PostWindow> for PostWindow {
+    fn from(window: layout::PostWindow) -> Self {
+        let layout::PostWindow { i0, j0, width, height } = window;
+        PostWindow { i: i0 as i64, j: j0 as i64, width, height }
     }
 }
 

@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use terrafarm_terrain::build::{LayerSource, SourceError};
+use terrafarm_terrain::layout;
 
 use crate::color::over;
 use crate::grid::{Grid, PostWindow, overlap};
@@ -41,15 +42,8 @@ impl PhotoStack {
 }
 
 impl LayerSource for PhotoStack {
-    fn colors(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
-        let texels = self.texels(PostWindow { i: i0, j: j0, width, height }).map_err(Box::new)?;
+    fn colors(&self, window: layout::PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
+        let texels = self.texels(window.into()).map_err(Box::new)?;
         if texels.iter().any(|texel| texel[3] > 0) {
             self.any_covered.store(true, Ordering::Relaxed);
         }

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use terrafarm_geo::{Crs, Transformer};
 use terrafarm_terrain::build::{LayerSource, SourceError};
-use terrafarm_terrain::layout::TILE_CELLS;
+use terrafarm_terrain::layout::{self, TILE_CELLS};
 use terrafarm_terrain::rounding::rounded;
 
 use crate::grid::{Grid, PostWindow};
@@ -401,15 +401,8 @@ impl<'a> Watched<'a> {
 }
 
 impl LayerSource for Watched<'_> {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        let window = PostWindow { i: i0, j: j0, width, height };
+    fn heights(&self, window: layout::PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        let window = PostWindow::from(window);
         let heights = self.heights.heights(window).map_err(Box::new)?;
         if heights.iter().any(|height| !height.is_nan()) {
             self.any_valid.store(true, Ordering::Relaxed);

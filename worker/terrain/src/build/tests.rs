@@ -239,16 +239,9 @@ fn equal_tiles_are_stored_once() {
 struct Failing(u64);
 
 impl LayerSource for Failing {
-    fn heights(
-        &self,
-        i0: i64,
-        _j0: i64,
-        _width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
         into.fill(0.0);
-        if i0 as u64 > self.0 { Err("the input ends".into()) } else { Ok(()) }
+        if window.i0 > self.0 { Err("the input ends".into()) } else { Ok(()) }
     }
 }
 

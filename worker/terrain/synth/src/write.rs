@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use terrafarm_terrain::build::{
     BuildError, LayerSource, LayerSpec, SourceError, StoreBuilder, StoreSummary,
 };
-use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, LayerKind, PostWindow};
 use terrafarm_terrain::rounding;
 
 /// Share of the work that shaping the land takes; the rest is tiles.
@@ -24,26 +24,14 @@ pub enum WriteError {
 }
 
 impl LayerSource for Synth {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        Ok(Synth::heights(self, i0, j0, width, height, into)?)
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        let PostWindow { i0, j0, width, height } = window;
+        Ok(Synth::heights(self, i0 as i64, j0 as i64, width, height, into)?)
     }
 
-    fn colors(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        height: usize,
-        into: &mut [[u8; 4]],
-    ) -> Result<(), SourceError> {
-        Ok(Synth::colors(self, i0, j0, width, height, into)?)
+    fn colors(&self, window: PostWindow, into: &mut [[u8; 4]]) -> Result<(), SourceError> {
+        let PostWindow { i0, j0, width, height } = window;
+        Ok(Synth::colors(self, i0 as i64, j0 as i64, width, height, into)?)
     }
 }
 

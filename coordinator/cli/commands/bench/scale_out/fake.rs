@@ -21,7 +21,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::id::FrameIndex;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_coordinator::client::{self, Coordinator, Submission, Update};
 use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::message::ShotDone;
@@ -241,14 +241,7 @@ fn submission(jobs: u64, store: Arc<StoreReader>) -> Submission {
     Submission {
         name: "scale-out".into(),
         store,
-        shading: Shading {
-            sun: None,
-            haze: None,
-            sky: Sky::default(),
-            earth: None,
-            below_ground: [0.0; 3],
-            bare_ground: None,
-        },
+        shading: Shading::default(),
         quality: Quality { method: Method::Auto, samples_per_side: 1, tolerance_px: 1.0 },
         check: Share::NONE,
         split: Split::Tiles(TILE_PX),

@@ -6,7 +6,7 @@ use crate::commands::bench::land::{Land, Rule, height_layer};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Quality;
-use terrafarm_common::shading::{Earth, Shading, Sky};
+use terrafarm_common::shading::{Earth, Shading};
 use terrafarm_raycast::View;
 use terrafarm_terrain::build::LayerSpec;
 
@@ -72,14 +72,7 @@ pub fn all(size: (u32, u32)) -> anyhow::Result<Vec<Scene>> {
 pub fn view(pose: Pose, size: (u32, u32), earth: Option<Earth>) -> View {
     let eye = DVec3::from_array(pose.at);
     let Pose { heading, pitch, roll, hfov, .. } = pose;
-    let shading = Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth,
-        below_ground: [1.0, 0.0, 0.0],
-        bare_ground: None,
-    };
+    let shading = Shading { earth, below_ground: [1.0, 0.0, 0.0], ..Shading::default() };
     let camera = Camera::from_angles(eye, heading, pitch, roll, hfov, size);
     View { camera, shading, quality: Quality::default() }
 }

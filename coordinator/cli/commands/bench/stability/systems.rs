@@ -8,7 +8,7 @@ use terrafarm_common::camera::Camera;
 use terrafarm_common::flight::{Flight, Keyframe};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
-use terrafarm_common::shading::{Shading, Sky};
+use terrafarm_common::shading::Shading;
 use terrafarm_raycast::{Progress, Unfit, Unseen, View, depths, render};
 use terrafarm_terrain::hillshade::hillshade;
 use terrafarm_terrain::layout::PostWindow;
@@ -143,14 +143,7 @@ fn no_tile() -> anyhow::Result<Vec<Cell>> {
     let land = Land::noise(257)?;
     let empty = Resident::new(land.resident.index().clone());
     let size = (33, 19);
-    let shading = Shading {
-        sun: None,
-        haze: None,
-        sky: Sky::default(),
-        earth: None,
-        below_ground: [0.0; 3],
-        bare_ground: None,
-    };
+    let shading = Shading::default();
     let camera =
         Camera::from_angles(DVec3::new(1280.0, 300.0, 4000.0), 0.0, -60.0, 0.0, 60.0, size);
     let cells = Method::ALL.map(|method| {

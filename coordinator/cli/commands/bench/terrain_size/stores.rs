@@ -10,7 +10,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::layout::{HeightDatum, ImportReport};
+use terrafarm_terrain::layout::{HeightDatum, ImportReport, PostWindow};
 use terrafarm_terrain::store::StoreReader;
 
 /// Distance between posts, metres.
@@ -26,16 +26,9 @@ struct Window {
 }
 
 impl LayerSource for Window {
-    fn heights(
-        &self,
-        i0: i64,
-        j0: i64,
-        width: usize,
-        _height: usize,
-        into: &mut [f32],
-    ) -> Result<(), SourceError> {
-        for (j, row) in (j0 as u64..).zip(into.chunks_mut(width.max(1))) {
-            noise::row(self.first + i0 as u64, self.first + j, row);
+    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
+        for (j, row) in (window.j0..).zip(into.chunks_mut(window.width.max(1))) {
+            noise::row(self.first + window.i0, self.first + j, row);
         }
         Ok(())
     }
