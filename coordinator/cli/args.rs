@@ -121,7 +121,8 @@ pub struct Render {
     pub threads: Option<u32>,
     /// Somebody waits for each frame: a worker that died or froze is noticed within half a
     /// second instead of five, and its jobs go to others; one that only stutters is dropped
-    /// and comes back
+    /// and comes back. Terrain that has not come to a worker is shown coarser instead of
+    /// waited for, and the manifest says in which frames
     #[arg(long)]
     pub live: bool,
     /// Who encodes MP4

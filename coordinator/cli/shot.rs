@@ -297,6 +297,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         fps: plan.fps,
         fallbacks: fallbacks.count,
         fallback_share: fallbacks.share(),
+        coarser_pixels: records.iter().map(|frame| frame.coarser_pixels).sum(),
         frames: records,
         failed,
         workers: done.workers.iter().map(WorkerEntry::new).collect(),

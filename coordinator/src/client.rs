@@ -87,6 +87,8 @@ pub struct FrameFacts {
     pub elapsed_us: u64,
     /// Samples that the method could not do its own way and gave a ray of their own.
     pub fallbacks: u64,
+    /// Pixels that show coarser terrain, because it had not come: in live shots only.
+    pub coarser: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
     /// The errors of the pixels that were measured, if any were to be.
@@ -405,6 +407,7 @@ pub(crate) fn unpack(frame: Frame, size: (u32, u32)) -> Result<(Rgb8, FrameFacts
         cost_us: frame.report.cost_us,
         elapsed_us: frame.elapsed_us,
         fallbacks: frame.report.fallbacks,
+        coarser: frame.report.coarser,
         below_ground: frame.report.below_ground,
         check: frame.check,
     };

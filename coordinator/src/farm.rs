@@ -304,6 +304,7 @@ impl Farm {
             check: state.submit.check,
             width: state.submit.width,
             height: state.submit.height,
+            live: state.submit.live,
         });
         worker_state.leases.insert(lease);
         self.granted.insert(lease, granted);

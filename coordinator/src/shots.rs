@@ -497,5 +497,6 @@ fn add(sum: &mut RenderReport, part: &RenderReport) {
     sum.rays = sum.rays.saturating_add(part.rays);
     sum.steps = sum.steps.saturating_add(part.steps);
     sum.fallbacks = sum.fallbacks.saturating_add(part.fallbacks);
+    sum.coarser = sum.coarser.saturating_add(part.coarser);
     sum.below_ground |= part.below_ground;
 }

@@ -1,7 +1,8 @@
-//! A live render: somebody waits for each frame, and a worker that freezes is noticed within
-//! half a second.
+//! A live render: somebody waits for each frame. A worker that freezes is noticed within half
+//! a second, and terrain that has not come is shown coarser, not waited for.
 
-use crate::support::{Running, World, coordinator, frame_hashes, succeed, worker};
+use crate::support::{Running, World, coordinator, frame_hashes, succeed, worker, worker_with};
+use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -86,7 +87,7 @@ fn a_worker_that_freezes_is_noticed_within_half_a_second_of_a_live_render() {
         let came = freeze(&mut farm, &mut frozen, &shot);
         let (code, lines) = running.finish();
         assert_eq!(code, Some(0), "{lines:#?}");
-        assert!(is_the_same(&output, &calm), "attempt {attempt}");
+        only_coarser_frames_differ(&output, &calm);
         if let Some(came) = came {
             let Attempt { noticed, silence, back } = came;
             println!("noticed after {noticed:?}, silent for {silence:?}, back after {back:?}");
@@ -99,6 +100,47 @@ fn a_worker_that_freezes_is_noticed_within_half_a_second_of_a_live_render() {
     panic!("never in time: {seen:?}");
 }
 
-fn is_the_same(output: &Path, expected: &[String]) -> bool {
-    frame_hashes(&output.join("manifest.json")) == expected
+/// Asserts that the frames that say nothing of coarser terrain are as expected; returns how
+/// many others there are.
+fn only_coarser_frames_differ(output: &Path, expected: &[String]) -> usize {
+    let manifest = output.join("manifest.json");
+    let hashes = frame_hashes(&manifest);
+    assert_eq!(hashes.len(), expected.len());
+    let manifest: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(manifest).unwrap()).unwrap();
+    let frames = manifest["frames"].as_array().unwrap();
+    let mut coarser = 0;
+    for ((frame, hash), expected) in frames.iter().zip(&hashes).zip(expected) {
+        match frame["coarser_pixels"].as_u64().unwrap() {
+            0 => assert_eq!(hash, expected, "{frame}"),
+            _ => coarser += 1,
+        }
+    }
+    assert_eq!(coarser > 0, manifest["coarser_pixels"].as_u64().unwrap() > 0);
+    coarser
+}
+
+#[test]
+fn a_live_render_waits_for_no_terrain_and_says_which_frames_are_coarser() {
+    let world = World::new(300);
+    let render = |extra: &[&str], output: &Path| {
+        let mut command = world.render();
+        command.args(["--size", "160x90", "--fps", "10", "--frames", "0..12"]);
+        command.args(extra).arg("-o").arg(output);
+        succeed(&mut command)
+    };
+    let calm = world.dir.path("calm");
+    render(&["--workers", "1", "--threads", "1"], &calm);
+    let calm = frame_hashes(&calm.join("manifest.json"));
+    let (mut farm, address) = coordinator();
+    // So slow that pixels are sent long before the terrain is there.
+    let _slow = worker_with(&address, "slow", &["--bandwidth", "1"]);
+    farm.expect("worker joined");
+    let output = world.dir.path("live");
+    let said = render(&["--live", "--coordinator", &address], &output);
+    assert!(only_coarser_frames_differ(&output, &calm) > 0, "{said}");
+    assert!(said.contains("of the pixels show coarser terrain"), "{said}");
+    let output = world.dir.path("patient");
+    render(&["--coordinator", &address], &output);
+    assert_eq!(only_coarser_frames_differ(&output, &calm), 0);
 }

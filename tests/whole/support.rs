@@ -253,18 +253,15 @@ pub fn coordinator_with_token(dir: &Dir) -> (Running, String, String) {
 
 /// A worker of its own process, one thread, no disk cache.
 pub fn worker(address: &str, name: &str) -> Running {
-    Running::start(terrafarm().args([
-        "-vv",
-        "worker",
-        "--coordinator",
-        address,
-        "--threads",
-        "1",
-        "--cache-limit",
-        "0",
-        "--name",
-        name,
-    ]))
+    worker_with(address, name, &[])
+}
+
+/// The same with more arguments.
+pub fn worker_with(address: &str, name: &str, more: &[&str]) -> Running {
+    let mut command = terrafarm();
+    command.args(["-vv", "worker", "--coordinator", address, "--name", name]);
+    command.args(["--threads", "1", "--cache-limit", "0"]).args(more);
+    Running::start(&mut command)
 }
 
 /// `../shared/data` beside the checkout, if it is there; says so if not.

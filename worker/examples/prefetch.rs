@@ -148,6 +148,7 @@ async fn fly(
         check: Share::NONE,
         width,
         height,
+        live: false,
     };
     outbox.send(open).await.expect("open");
     let mut grants: VecDeque<Grant> = (0..FRAMES * COLUMNS)

@@ -1,7 +1,8 @@
 //! One job on all cores: pieces of its region, each rendered as far as its tiles allow.
 //!
 //! A job keeps what is done of every piece, so that a pause for missing tiles repeats
-//! nothing. A piece whose pixels are done has some of them measured, if the shot asks for
+//! nothing. A live job does not wait: what is left of it is shown as coarse as it is at hand.
+//! A piece whose pixels are done has some of them measured, if the shot asks for
 //! that; tiles that only the measurement needs are waited for like others. The stop flag is looked at before each piece: a revoked job ends within the
 //! time of one piece a core. A panic of the ray caster ends the job, not the worker.
 
@@ -16,9 +17,13 @@ use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::{PixelError, Share, Summary, pixel_number};
 use terrafarm_common::id::{FrameIndex, LeaseId};
 use terrafarm_common::image::Rgb8;
+use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::{Region, tiles};
 use terrafarm_raycast::meter::measure;
-use terrafarm_raycast::{Missing, Progress, Pyramid, Rendered, Stats, Unfit, Unseen, View, depths};
+use terrafarm_raycast::{
+    Glimpse, Missing, Progress, Pyramid, Rendered, Stats, Unfit, Unseen, View, depths,
+    render_at_hand,
+};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_terrain::resident::Resident;
 
@@ -54,6 +59,17 @@ pub trait Caster: Send + Sync + 'static {
 
     /// The pixels of a piece that waits for nothing.
     fn finish(&self, piece: Self::Piece) -> Rendered;
+
+    /// What can be shown of a region with the tiles in memory, whatever is missing.
+    ///
+    /// # Errors
+    /// If there is nothing to show, or the method is not made for the view.
+    fn glimpse(
+        &self,
+        scene: &Scene<Self::Prepared>,
+        view: &View,
+        region: Region,
+    ) -> Result<Glimpse, Unseen>;
 
     /// The tiles that a region of a view will probably need and that are not in memory: a
     /// guess, soon made. A caster that needs no tiles has none to name.
@@ -117,6 +133,22 @@ impl Caster for RayCaster {
         piece.into_rendered(Vec::new())
     }
 
+    fn glimpse(
+        &self,
+        scene: &Scene<Pyramid>,
+        view: &View,
+        region: Region,
+    ) -> Result<Glimpse, Unseen> {
+        // Of the methods, these two can do with coarser ground.
+        let method = match view.quality.method {
+            Method::Column => Method::Column,
+            _ => Method::Lod,
+        };
+        let quality = Quality { method, ..view.quality };
+        let view = View { quality, ..view.clone() };
+        render_at_hand(&scene.resident, &scene.prepared, &view, region)
+    }
+
     fn scout(&self, scene: &Scene<Pyramid>, view: &View, region: Region) -> Vec<TileKey> {
         terrafarm_raycast::scout(&scene.resident, &scene.prepared, view, region)
     }
@@ -163,12 +195,16 @@ pub struct Job<C: Caster> {
     spent: Duration,
     /// How much of it others had the cores, all threads together.
     coreless: AtomicU64,
+    /// It settled for what is at hand, and there was nothing.
+    has_nothing: bool,
 }
 
 struct Piece<C: Caster> {
     region: Region,
     progress: C::Piece,
     rendered: bool,
+    /// What is shown instead, if it was not to be waited for.
+    glimpse: Option<Glimpse>,
     /// Pixels that are still to be measured.
     unmeasured: Vec<[u32; 2]>,
     errors: Summary,
@@ -191,6 +227,9 @@ pub struct Picture {
     pub pixels: Vec<u8>,
     /// Rays, steps and the like; those of the check left out.
     pub stats: Stats,
+    /// Pixels that show coarser terrain, because it had not come: counted by pieces of
+    /// [`PIECE_PX`], of ground and colour whichever is more.
+    pub coarser: u64,
     /// The errors of the pixels that were measured, if any were to be.
     pub errors: Option<Summary>,
     /// Time on the pool, waiting for tiles left out.
@@ -215,6 +254,7 @@ impl<C: Caster> Job<C> {
                 region,
                 progress: caster.begin(region),
                 rendered: false,
+                glimpse: None,
                 unmeasured: check.pixels(region),
                 errors: Summary::default(),
             }
@@ -228,6 +268,7 @@ impl<C: Caster> Job<C> {
             stop,
             spent: Duration::ZERO,
             coreless: AtomicU64::new(0),
+            has_nothing: false,
         }
     }
 
@@ -239,8 +280,35 @@ impl<C: Caster> Job<C> {
         scene: &Scene<C::Prepared>,
         gate: &Gate,
     ) -> Result<Outcome<C>, String> {
+        self.has_nothing = false;
+        self.go(caster, gate, |piece, view, frame| piece.advance(caster, scene, view, frame))
+    }
+
+    /// As [`Job::advance`], but nothing is tried again: what waits for tiles is shown as it is
+    /// at hand, and not measured. A job still waits if there is nothing to show.
+    pub fn settle(
+        mut self: Box<Self>,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+        gate: &Gate,
+    ) -> Result<Outcome<C>, String> {
+        self.has_nothing = true;
+        self.go(caster, gate, |piece, view, _| piece.settle(caster, scene, view))
+    }
+
+    /// Whether it waits because there was nothing to show at all.
+    pub fn has_nothing_to_show(&self) -> bool {
+        self.has_nothing
+    }
+
+    fn go(
+        mut self: Box<Self>,
+        caster: &C,
+        gate: &Gate,
+        step: impl Fn(&mut Piece<C>, &View, FrameIndex) -> Result<BTreeSet<TileKey>, Unfit> + Sync,
+    ) -> Result<Outcome<C>, String> {
         let began = Instant::now();
-        let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(caster, scene, gate)));
+        let missing = catch_unwind(AssertUnwindSafe(|| self.sweep(gate, step)));
         self.spent += began.elapsed();
         let missing = missing
             .map_err(|panic| format!("the ray caster failed: {}", said(&*panic)))?
@@ -257,9 +325,8 @@ impl<C: Caster> Job<C> {
     /// One go over all pieces that are not done; the tiles they wait for.
     fn sweep(
         &mut self,
-        caster: &C,
-        scene: &Scene<C::Prepared>,
         gate: &Gate,
+        step: impl Fn(&mut Piece<C>, &View, FrameIndex) -> Result<BTreeSet<TileKey>, Unfit> + Sync,
     ) -> Result<BTreeSet<TileKey>, Unfit> {
         let (view, stop, frame) = (&self.view, &self.stop, self.check.frame);
         let coreless = &self.coreless;
@@ -270,7 +337,7 @@ impl<C: Caster> Job<C> {
                 return;
             }
             let counted = CoreClock::start(coreless);
-            let more = piece.advance(caster, scene, view, frame);
+            let more = step(piece, view, frame);
             drop(counted);
             let mut missing = missing.lock().unwrap_or_else(PoisonError::into_inner);
             match (&mut *missing, more) {
@@ -287,12 +354,14 @@ impl<C: Caster> Job<C> {
         let mut picture = Rgb8::new(self.region.width, self.region.height);
         let mut stats = Stats::default();
         let mut errors = Summary::default();
+        let mut coarser = 0;
         for piece in self.pieces {
             let Region { x, y, .. } = self.region;
             let place = Region { x: piece.region.x - x, y: piece.region.y - y, ..piece.region };
             let done = piece.is_done();
             let rendered = caster.finish(piece.progress);
-            if !done || !picture.paste(place, &rendered.pixels) {
+            let shown = piece.glimpse.as_ref().map_or(&rendered.pixels, |glimpse| &glimpse.pixels);
+            if !done || !picture.paste(place, shown) {
                 return Err(format!("the ray caster left {:?} undone", piece.region));
             }
             stats.rays += rendered.stats.rays;
@@ -301,11 +370,14 @@ impl<C: Caster> Job<C> {
             stats.fallbacks += rendered.stats.fallbacks;
             stats.below_ground |= rendered.stats.below_ground;
             errors.merge(&piece.errors);
+            if let Some(glimpse) = &piece.glimpse {
+                coarser += glimpse.coarser_ground.max(glimpse.coarser_color);
+            }
         }
         let spent = self.spent + began.elapsed();
         let coreless = Duration::from_nanos(self.coreless.into_inner());
         let errors = (self.check.share != Share::NONE).then_some(errors);
-        Ok(Picture { pixels: picture.into_pixels(), stats, errors, spent, coreless })
+        Ok(Picture { pixels: picture.into_pixels(), stats, coarser, errors, spent, coreless })
     }
 }
 
@@ -372,6 +444,28 @@ impl<C: Caster> Piece<C> {
             }
         }
         self.measure(caster, scene, view, frame)
+    }
+
+    /// Shows what is at hand of what is not rendered; the tiles to wait for if there is
+    /// nothing.
+    fn settle(
+        &mut self,
+        caster: &C,
+        scene: &Scene<C::Prepared>,
+        view: &View,
+    ) -> Result<BTreeSet<TileKey>, Unfit> {
+        if !self.rendered {
+            match caster.glimpse(scene, view, self.region) {
+                Ok(glimpse) if glimpse.holes == 0 => self.glimpse = Some(glimpse),
+                Ok(Glimpse { wanted, .. }) | Err(Unseen::Missing(wanted)) => {
+                    return Ok(wanted.into_iter().collect());
+                }
+                Err(Unseen::Unfit(unfit)) => return Err(unfit),
+            }
+        }
+        self.rendered = true;
+        self.unmeasured.clear();
+        Ok(BTreeSet::new())
     }
 
     /// Measures what can be measured; the tiles that the rest waits for.

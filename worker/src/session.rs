@@ -7,7 +7,9 @@
 //!
 //! A grant waits in the queue, then for the index of its store, then renders; when the
 //! ray caster names tiles that are not in memory, it pauses for them and renders what is
-//! left. At most one job is begun at a time: it is spread over all cores. A blob is
+//! left. A job of a live shot waits only for what is on this PC: when all else is known to be
+//! elsewhere it settles for what is in memory, and the rest comes for the frames after it.
+//! At most one job is begun at a time: it is spread over all cores. A blob is
 //! looked for on this PC first, then asked of the coordinator, each once however many
 //! wait for it; the coordinator may name other workers that have it (`supply`).
 //!
@@ -103,6 +105,9 @@ pub enum Action {
     Start(Grant, Arc<OpenShot>),
     /// Go on with the paused job. Answered like `Start`.
     Resume(LeaseId),
+    /// Finish the paused job with the tiles in memory. Answered like `Start`; by `Paused` only
+    /// if there is nothing to show.
+    Settle(LeaseId),
     /// Stop the job that runs, soon. Answered by any of its answers.
     Stop(LeaseId),
     /// Forget the paused job. Not answered.
@@ -123,6 +128,8 @@ pub struct Session {
     current: Option<Current>,
     supply: Supply,
     outlook: Outlook,
+    /// What the last live job did without, and the next ones will not have to.
+    foregone: BTreeSet<BlobHash>,
     /// Stores whose index is in memory.
     mapped: BTreeSet<BlobHash>,
     unsent: usize,
@@ -147,6 +154,10 @@ struct Current {
     phase: Phase,
     /// Whether `Start` has been given.
     begun: bool,
+    /// It can do without what is not on this PC.
+    lenient: bool,
+    /// `Settle` has been given, and not `Resume` since.
+    settled: bool,
 }
 
 #[derive(Debug)]
@@ -172,6 +183,14 @@ pub enum Doing {
     Sending,
 }
 
+impl Current {
+    fn settle(&mut self, actions: &mut VecDeque<Action>) {
+        self.phase = Phase::Rendering;
+        self.settled = true;
+        actions.push_back(Action::Settle(self.grant.lease));
+    }
+}
+
 impl Session {
     /// A session that holds nothing.
     pub fn new() -> Self {
@@ -186,13 +205,17 @@ impl Session {
         match event {
             Event::Received(message) => self.receive(message),
             Event::Loaded(hash) => self.supplied(hash),
-            Event::Absent(hash) => self.supply.absent(hash),
+            Event::Absent(hash) => {
+                self.supply.absent(hash);
+                self.forgo(hash);
+            }
             Event::Spoiled(hash, why) => {
                 let failure = self.supply.lost(hash);
                 self.failed_supply(hash, failure, &why);
             }
             Event::Damaged(hash) => {
                 let failure = self.supply.damaged(hash);
+                self.forgo(hash);
                 self.failed_supply(hash, failure, "what came has another hash");
             }
             Event::Stocked(hash) => self.supply.stocked(hash, &mut self.actions),
@@ -310,6 +333,7 @@ impl Session {
         self.hand_back(orphans);
         self.outlook.close(shot);
         self.supply.forget_foreseen();
+        self.foregone.clear();
         self.actions.push_back(Action::Close(shot));
         if !self.shots.values().any(|open| open.index == closed.index) {
             self.mapped.remove(&closed.index);
@@ -332,7 +356,8 @@ impl Session {
             let Some(shot) = self.shots.get(&grant.shot).cloned() else { continue };
             let index = shot.index;
             let phase = Phase::Waiting(BTreeSet::from([index]));
-            self.current = Some(Current { grant, shot, phase, begun: false });
+            self.current =
+                Some(Current { grant, shot, phase, begun: false, lenient: false, settled: false });
             self.supply.need(index, &mut self.actions);
         }
     }
@@ -356,13 +381,39 @@ impl Session {
         };
         match job.phase {
             Phase::Rendering => {
-                job.phase = Phase::Waiting(missing.iter().copied().collect());
+                job.lenient = job.shot.live && !job.settled;
+                if job.lenient {
+                    self.foregone.clear();
+                }
+                let mut waits = BTreeSet::new();
                 for hash in missing {
-                    self.supply.need(hash, &mut self.actions);
+                    let may_be_here = self.supply.need(hash, &mut self.actions);
+                    let set = match job.lenient && !may_be_here {
+                        true => &mut self.foregone,
+                        false => &mut waits,
+                    };
+                    set.insert(hash);
+                }
+                if waits.is_empty() {
+                    job.settle(&mut self.actions);
+                } else {
+                    job.phase = Phase::Waiting(waits);
                 }
             }
             Phase::Stopping => self.drop_waiting(),
             Phase::Waiting(_) => {}
+        }
+    }
+
+    /// A blob is not on this PC: a job that can do without it does.
+    fn forgo(&mut self, hash: BlobHash) {
+        let Some(job) = self.current.as_mut().filter(|job| job.lenient) else { return };
+        let Phase::Waiting(missing) = &mut job.phase else { return };
+        if missing.remove(&hash) {
+            self.foregone.insert(hash);
+            if missing.is_empty() {
+                job.settle(&mut self.actions);
+            }
         }
     }
 
@@ -387,6 +438,7 @@ impl Session {
         let Phase::Waiting(missing) = &mut job.phase else { return };
         if missing.remove(&hash) && missing.is_empty() {
             job.phase = Phase::Rendering;
+            job.settled = false;
             self.actions.push_back(if std::mem::replace(&mut job.begun, true) {
                 Action::Resume(job.grant.lease)
             } else {
@@ -434,7 +486,10 @@ impl Session {
             Some(Phase::Waiting(missing)) => Some(missing),
             _ => None,
         };
-        let waits = |hash| missing.is_some_and(|missing| missing.contains(&hash));
+        let foregone = &self.foregone;
+        let waits = |hash| {
+            foregone.contains(&hash) || missing.is_some_and(|missing| missing.contains(&hash))
+        };
         let calm = missing.is_none() && self.leaving.is_none();
         self.supply.ask(waits, calm, &mut self.actions);
     }

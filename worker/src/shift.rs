@@ -10,7 +10,7 @@ mod status;
 
 use crate::clock::{TaskClock, Worked};
 use crate::office::Gate;
-use crate::render::{Caster, Check, Job, Outcome, Picture, said};
+use crate::render::{Caster, Check, Job, Outcome, Picture, Scene, said};
 use crate::session::{Action, Doing, Event, Session};
 use crate::share::{Others, Shelf};
 use crate::terrain::Terrain;
@@ -62,6 +62,10 @@ pub(crate) struct Site<C: Caster> {
     /// Blobs that the coordinator sent and that were not what they should be.
     pub damaged: u64,
 }
+
+/// A go at a job: [`Job::advance`] or [`Job::settle`].
+type Work<C> =
+    fn(Box<Job<C>>, &C, &Scene<<C as Caster>::Prepared>, &Gate) -> Result<Outcome<C>, String>;
 
 /// What the thread pool has done.
 enum Report<C: Caster> {
@@ -248,7 +252,8 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Action::Fetch(elsewhere) => self.fetch(elsewhere),
                 Action::Glance(glance, shot) => self.glance(glance, &shot),
                 Action::Start(grant, shot) => self.start(&grant, &shot),
-                Action::Resume(lease) => self.resume(lease),
+                Action::Resume(lease) => self.go_on(lease, Job::advance),
+                Action::Settle(lease) => self.go_on(lease, Job::settle),
                 Action::Stop(_) => {
                     self.stop_current();
                     None
@@ -342,16 +347,18 @@ impl<'a, C: Caster> Shift<'a, C> {
             View { camera: grant.camera, shading: shot.shading.clone(), quality: shot.quality };
         let (lease, region) = (grant.lease, grant.region);
         let check = Check { share: shot.check, frame: grant.frame };
-        self.launch(lease, move |caster| {
-            Box::new(Job::new(caster, lease, view, region, check, stop))
-        })
+        self.launch(
+            lease,
+            move |caster| Box::new(Job::new(caster, lease, view, region, check, stop)),
+            Job::advance,
+        )
     }
 
-    fn resume(&mut self, lease: LeaseId) -> Option<Event> {
+    fn go_on(&mut self, lease: LeaseId, work: Work<C>) -> Option<Event> {
         let Some(job) = self.paused.take() else {
             return Some(Event::Broken(lease, "it is not paused".to_owned()));
         };
-        self.launch(lease, move |_| job)
+        self.launch(lease, move |_| job, work)
     }
 
     /// Puts a job on the thread pool: everything that grows with its size happens there.
@@ -359,6 +366,7 @@ impl<'a, C: Caster> Shift<'a, C> {
         &mut self,
         lease: LeaseId,
         job: impl FnOnce(&C) -> Box<Job<C>> + Send + 'static,
+        work: Work<C>,
     ) -> Option<Event> {
         let scene = self.current.as_ref().and_then(|(store, _)| self.site.terrain.scene(*store));
         let Some(scene) = scene else {
@@ -368,7 +376,7 @@ impl<'a, C: Caster> Shift<'a, C> {
         let gate = self.site.gate.clone();
         self.spawn(
             move || {
-                let outcome = job(&caster).advance(&*caster, &scene, &gate);
+                let outcome = work(job(&caster), &caster, &scene, &gate);
                 // The tiles are free to change before anyone hears of the outcome.
                 drop(scene);
                 match outcome {
@@ -437,7 +445,12 @@ impl<'a, C: Caster> Shift<'a, C> {
             Report::Missing(job, keys) => {
                 let lease = job.lease;
                 let store = self.current.as_ref().map(|(store, _)| *store);
-                let hashes = store.map(|store| terrain.await_tiles(store, &keys));
+                // With the roots there is something to show, so a live job waits for no more.
+                let roots = store.filter(|_| job.has_nothing_to_show());
+                let roots = roots.map(|store| terrain.await_tiles(store, &[]));
+                let hashes = roots
+                    .filter(|roots| !roots.is_empty())
+                    .or_else(|| store.map(|store| terrain.await_tiles(store, &keys)));
                 match hashes {
                     Some(hashes) if !hashes.is_empty() => {
                         self.paused = Some(job);
@@ -547,6 +560,7 @@ fn packed(lease: LeaseId, picture: Picture, compress: bool) -> Result<(Done, Wor
         rays: picture.stats.rays,
         steps: picture.stats.steps,
         fallbacks: picture.stats.fallbacks,
+        coarser: picture.coarser,
         below_ground: picture.stats.below_ground,
     };
     let worked =

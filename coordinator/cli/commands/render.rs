@@ -145,6 +145,7 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
             "workers": report.manifest.workers.len(),
             "fallbacks": report.manifest.fallbacks,
             "fallback_share": report.manifest.fallback_share,
+            "coarser_pixels": report.manifest.coarser_pixels,
             "check": report.errors.as_ref().map(check_json),
         });
         println!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
@@ -165,6 +166,14 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
         println!(
             "{:.2} % of the pixels were not done the method's own way but by rays of their own",
             100.0 * report.manifest.fallback_share
+        );
+    }
+    let coarser = report.manifest.coarser_pixels;
+    if coarser > 0 {
+        let all = f64::from(width) * f64::from(height) * frames as f64;
+        println!(
+            "{:.2} % of the pixels show coarser terrain: the finer had not come yet",
+            100.0 * coarser as f64 / all
         );
     }
     println!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());

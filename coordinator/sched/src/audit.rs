@@ -132,6 +132,10 @@ impl Scheduler {
         {
             return;
         }
+        // A live frame shows the terrain that its worker has: others may have more of it.
+        if self.shots.get(&lease.shot).is_none_or(|shot| shot.is_live) {
+            return;
+        }
         let audit = Audit {
             of,
             shot: lease.shot,

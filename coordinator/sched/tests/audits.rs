@@ -162,6 +162,15 @@ fn an_only_worker_is_not_audited() {
 }
 
 #[test]
+fn a_live_shot_is_not_audited_for_workers_may_have_different_terrain() {
+    let mut world = farm(100, 4, &[]);
+    world.submit_as(1, 3, 0, 4e6, true);
+    world.play(60 * SECOND, |_| ());
+    assert!(is_over(&world));
+    assert_eq!(world.scheduler.account().audited, 0);
+}
+
+#[test]
 fn an_operator_lifts_distrust_and_one_who_comes_back_keeps_it() {
     let mut world = farm(0, 2, &[]);
     world.submit(1, 1000, 0, 4e6);

@@ -108,7 +108,7 @@ fn grants(out: &[Out]) -> Vec<(WorkerId, Grant)> {
 fn done(grant: &Grant) -> Done {
     let pixels = vec![grant.lease.0 as u8; grant.region.area() as usize * 3];
     let report =
-        RenderReport { cost_us: 500, rays: 1, steps: 1, fallbacks: 3, below_ground: false };
+        RenderReport { cost_us: 500, rays: 1, steps: 1, fallbacks: 3, ..RenderReport::default() };
     let mut errors = Summary::default();
     let error = PixelError {
         surface_px: f64::from(grant.region.x),

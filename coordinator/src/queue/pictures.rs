@@ -232,6 +232,8 @@ fn manifest(
         fps: plan.fps,
         fallbacks,
         fallback_share: fallbacks as f64 / samples.max(1) as f64,
+        // Nobody waits for the frames of a queue.
+        coarser_pixels: 0,
         failed: failed.collect(),
         frames: entries,
         workers: record.workers.clone(),

@@ -48,6 +48,10 @@ pub struct Manifest {
     /// Their share of all samples, 0 to 1: of the pixels, if `samples` is 1.
     #[serde(default)]
     pub fallback_share: f64,
+    /// Of a live shot: pixels of all frames that show coarser terrain than was asked for,
+    /// because it had not come.
+    #[serde(default)]
+    pub coarser_pixels: u64,
     /// The frames, in order; those that failed are left out.
     pub frames: Vec<FrameEntry>,
     /// Frames that could not be rendered, and why.
@@ -86,6 +90,9 @@ pub struct FrameEntry {
     /// As [`Manifest::fallback_share`], of this frame.
     #[serde(default)]
     pub fallback_share: f64,
+    /// As [`Manifest::coarser_pixels`], of this frame.
+    #[serde(default)]
+    pub coarser_pixels: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
     /// With `--check`: 99th percentile of the error, pixels.
@@ -123,6 +130,7 @@ impl FrameEntry {
             jobs: facts.jobs,
             fallbacks,
             fallback_share: fallbacks as f64 / samples.max(1) as f64,
+            coarser_pixels: facts.coarser.min(pixels),
             below_ground: facts.below_ground,
             error_px_p99: error_px.map(|error| error.p99),
             error_px_max: error_px.map(|error| error.max),

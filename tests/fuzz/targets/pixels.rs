@@ -43,7 +43,7 @@ fn accepts(input: &[u8]) -> bool {
 }
 
 fn frame_of(pixels: &[u8]) -> Vec<u8> {
-    let report = RenderReport { cost_us: 1, rays: 2, steps: 3, fallbacks: 0, below_ground: false };
+    let report = RenderReport { cost_us: 1, rays: 2, steps: 3, ..RenderReport::default() };
     let pixels = Pixels::compressed(Bytes::copy_from_slice(pixels)).expect("few pixels");
     let done =
         Done { lease: LeaseId(1), report, timesheet: Default::default(), check: None, pixels };

@@ -79,8 +79,8 @@ pub(super) enum Failure {
 }
 
 impl Supply {
-    /// A job waits for a blob.
-    pub fn need(&mut self, hash: BlobHash, actions: &mut VecDeque<Action>) {
+    /// A job waits for a blob. Whether it may be on this PC already.
+    pub fn need(&mut self, hash: BlobHash, actions: &mut VecDeque<Action>) -> bool {
         match self.blobs.entry(hash) {
             Entry::Vacant(unknown) => {
                 let stage = Stage::Looking;
@@ -97,6 +97,7 @@ impl Supply {
             }
             Entry::Occupied(_) => {}
         }
+        matches!(self.stage(hash), Some(Stage::Looking | Stage::Keeping))
     }
 
     /// Blobs will be needed, in this order, after those that were foreseen before.

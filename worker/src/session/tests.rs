@@ -16,6 +16,8 @@ use terrafarm_wire::message::{
 use terrafarm_wire::pixels::Pixels;
 
 const INDEX: BlobHash = BlobHash([1; 32]);
+/// The shot for which somebody waits.
+const LIVE: u64 = 3;
 
 fn tile(number: u8) -> BlobHash {
     BlobHash([100 + number; 32])
@@ -24,9 +26,9 @@ fn tile(number: u8) -> BlobHash {
 fn open(shot: u64) -> Event {
     let shading = Shading::default();
     let (quality, check) = (Quality::default(), Share::NONE);
-    let shot = ShotId(shot);
+    let (shot, live) = (ShotId(shot), shot == LIVE);
     Event::Received(
-        OpenShot { shot, index: INDEX, shading, quality, check, width: 8, height: 4 }.into(),
+        OpenShot { shot, index: INDEX, shading, quality, check, width: 8, height: 4, live }.into(),
     )
 }
 
@@ -77,6 +79,7 @@ fn short(action: &Action) -> String {
         Action::Send(Message::HandBack(back)) => format!("hand back {}", back.leases.len()),
         Action::Send(Message::Goodbye(_)) => "goodbye".to_owned(),
         Action::Send(other) => format!("send {other:?}"),
+        Action::Settle(lease) => format!("settle {lease}"),
         Action::Load(hash) => format!("load {hash}"),
         Action::Take(blob) => format!("take {}", blob.hash),
         Action::Start(grant, _) => format!("start {}", grant.lease),
@@ -335,6 +338,49 @@ fn damaged_blobs_are_asked_for_again_and_not_for_ever() {
     assert!(said[1].ends_with("what came has another hash"), "{said:?}");
 }
 
+/// A live shot's job that has begun, and lacks tile 1 and tile 2.
+fn live_job_that_lacks_two() -> Session {
+    let mut session = Session::new();
+    after(&mut session, [open(LIVE), grant(1, LIVE), Event::Loaded(INDEX)]);
+    let said = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1), tile(2)])]);
+    assert_eq!(said, [format!("load {}", tile(1)), format!("load {}", tile(2))]);
+    session
+}
+
+#[test]
+fn a_live_job_waits_for_what_is_on_this_pc_and_settles_for_the_rest_which_is_asked_for() {
+    let mut session = live_job_that_lacks_two();
+    assert_eq!(after(&mut session, [Event::Absent(tile(1))]), ["want 1"]);
+    assert_eq!(after(&mut session, [Event::Absent(tile(2))]), ["settle lease-1", "want 1"]);
+    assert_eq!(after(&mut session, [Event::Rendered(done(1))]), ["done lease-1"]);
+    // It comes for the next one.
+    let said = after(&mut session, [Event::Received(blob(tile(1)).into())]);
+    assert_eq!(said, [format!("take {}", tile(1))]);
+    assert!(after(&mut session, [Event::Loaded(tile(1)), Event::Sent]).is_empty());
+
+    let mut session = live_job_that_lacks_two();
+    assert_eq!(after(&mut session, [Event::Absent(tile(1))]), ["want 1"]);
+    assert_eq!(after(&mut session, [Event::Loaded(tile(2))]), ["resume lease-1"]);
+    // It is on its way: nothing to wait for on this PC.
+    let said = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1)])]);
+    assert_eq!(said, ["settle lease-1"]);
+}
+
+#[test]
+fn a_live_job_with_nothing_to_show_waits_until_there_is_something() {
+    let mut session = live_job_that_lacks_two();
+    after(&mut session, [Event::Absent(tile(1)), Event::Absent(tile(2))]);
+    // The root of the pyramid.
+    let said = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(3)])]);
+    assert_eq!(said, [format!("load {}", tile(3))]);
+    assert_eq!(after(&mut session, [Event::Absent(tile(3))]), ["want 1"]);
+    let root = Event::Received(blob(tile(3)).into());
+    assert_eq!(after(&mut session, [root]), [format!("take {}", tile(3))]);
+    assert_eq!(after(&mut session, [Event::Loaded(tile(3))]), ["resume lease-1"]);
+    let said = after(&mut session, [Event::Paused(LeaseId(1), vec![tile(1), tile(2)])]);
+    assert_eq!(said, ["settle lease-1"]);
+}
+
 /// A world that answers in any order, and keeps the rules in view.
 #[derive(Default)]
 struct World {
@@ -354,6 +400,12 @@ struct World {
     running: Option<u64>,
     paused: Option<u64>,
     needs: BTreeSet<BlobHash>,
+    /// What the last live job lacked.
+    lacked: BTreeSet<BlobHash>,
+    /// Leases of the live shot.
+    live: BTreeSet<u64>,
+    /// The job has settled, and waits again or renders.
+    settled: bool,
     unsent: usize,
     ended: bool,
 }
@@ -366,7 +418,11 @@ impl World {
                 Action::Send(message) => {
                     if let (Message::WantBlobs(want), Doing::Waiting) = (&message, session.doing())
                     {
-                        let needed = |hash| self.needs.contains(hash) || *hash == INDEX;
+                        let needed = |hash| {
+                            self.needs.contains(hash)
+                                || self.lacked.contains(hash)
+                                || *hash == INDEX
+                        };
                         assert!(want.hashes.iter().all(needed), "for later while a job waits");
                     }
                     self.hear(&message);
@@ -394,11 +450,22 @@ impl World {
                     assert!(self.memory.contains(&shot.index), "no render before its index");
                     assert_eq!((self.running, self.paused), (None, None), "one job at a time");
                     self.running = Some(grant.lease.0);
+                    self.settled = false;
                 }
                 Action::Resume(lease) => {
-                    assert!(self.needs.is_subset(&self.memory), "no render before its tiles");
+                    let lenient = self.live.contains(&lease.0) && !self.settled;
+                    let some = !self.needs.is_disjoint(&self.memory);
+                    let all = self.needs.is_subset(&self.memory);
+                    assert!(if lenient { some } else { all }, "no render before its tiles");
                     assert_eq!((self.running, self.paused.take()), (None, Some(lease.0)));
                     self.running = Some(lease.0);
+                    self.settled = false;
+                }
+                Action::Settle(lease) => {
+                    assert!(self.live.contains(&lease.0) && !self.settled, "it can wait");
+                    assert_eq!((self.running, self.paused.take()), (None, Some(lease.0)));
+                    self.running = Some(lease.0);
+                    self.settled = true;
                 }
                 Action::Stop(lease) => assert_eq!(self.running, Some(lease.0)),
                 Action::Discard(lease) => assert_eq!(self.paused.take(), Some(lease.0)),
@@ -444,7 +511,11 @@ impl World {
             0..=3 => {
                 *next_lease += 1;
                 self.held.insert(*next_lease);
-                Some(grant(*next_lease, 1 + u64::from(pick % 3)))
+                let shot = 1 + u64::from(pick % 3);
+                if shot == LIVE {
+                    self.live.insert(*next_lease);
+                }
+                Some(grant(*next_lease, shot))
             }
             4 => Some(open(1 + u64::from(pick % 3))),
             5 => Some(Event::Received(CloseShot { shot: ShotId(1 + u64::from(pick % 3)) }.into())),
@@ -469,6 +540,9 @@ impl World {
                 self.needs.iter().for_each(|hash| {
                     self.memory.remove(hash);
                 });
+                if self.live.contains(&lease.0) && !self.settled {
+                    self.lacked = self.needs.clone();
+                }
                 Event::Paused(lease, self.needs.iter().copied().collect())
             }),
             15 | 16 => from_pool(self).map(|lease| Event::Rendered(done(lease.0))),

@@ -1,7 +1,6 @@
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::id::{BlobHash, LeaseId, ShotId};
@@ -9,11 +8,10 @@ use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Region;
 use terrafarm_common::shading::{Shading, Sky, Sun};
 use terrafarm_raycast::{Pyramid, View, render};
-use terrafarm_terrain::build::{LayerSource, LayerSpec, SourceError, StoreBuilder};
-use terrafarm_terrain::codec::decode;
+use terrafarm_terrain::codec::{decode, encode_heights};
 use terrafarm_terrain::layout::*;
 use terrafarm_terrain::resident::Resident;
-use terrafarm_terrain::store::StoreReader;
+use terrafarm_terrain::store::hash_of;
 use terrafarm_wire::message::{Grant, OpenShot};
 
 /// Size of every frame, pixels.
@@ -26,42 +24,41 @@ pub struct Terrain {
     pub blobs: BTreeMap<BlobHash, Vec<u8>>,
 }
 
-fn height(x: u64, y: u64) -> f32 {
-    let (x, y) = (x as i64, y as i64);
+fn height(x: i64, y: i64) -> f32 {
+    let (x, y) = (x.clamp(0, 512), y.clamp(0, 512));
     let ridge = (x / 7 % 23 - 11).abs() * 4 + (y / 5 % 17 - 8).abs() * 3;
     (ridge + x * y / 4096) as f32
 }
 
-struct Hills;
-
-impl LayerSource for Hills {
-    fn heights(&self, window: PostWindow, into: &mut [f32]) -> Result<(), SourceError> {
-        window.fill(into, height);
-        Ok(())
-    }
-}
-
 impl Terrain {
     pub fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("hills.terrain");
-        let spec = LayerSpec {
+        let mut blobs = BTreeMap::new();
+        let mut layer = Layer {
             kind: LayerKind::Height,
-            origin: [0.0; 2],
-            spacing: [10.0; 2],
-            posts: [513; 2],
-            quantum_m: Some(1.0),
+            origin: [0.0, 0.0],
+            spacing: [10.0, 10.0],
+            posts: [513, 513],
+            levels: Vec::new(),
         };
-        let mut builder = StoreBuilder::create(&path, "LOCAL", HeightDatum::Unknown, None).unwrap();
-        builder.add_layer(spec, &Hills, &|_, _| (), &AtomicBool::new(false)).unwrap();
-        builder.finish(ImportReport::default()).unwrap();
-        let store = StoreReader::open(&path).unwrap();
-        let (index_hash, bytes) = store.index_blob();
-        let tiles = store.index().layers[0].levels.iter().flat_map(|level| &level.entries);
-        let mut blobs: BTreeMap<_, _> =
-            tiles.map(|tile| (tile.hash, store.read_blob(&tile.hash).unwrap())).collect();
-        blobs.insert(index_hash, bytes.to_vec());
-        Terrain { index: store.index().clone(), index_hash, blobs }
+        for level in 0..Layer::level_count(layer.posts) {
+            let tiles = Layer::tiles_for(layer.level_posts(level));
+            let places = (0..tiles[1]).flat_map(|ty| (0..tiles[0]).map(move |tx| (tx, ty)));
+            let entries = places.map(|place| tile(level, place, &mut blobs)).collect();
+            layer.levels.push(Level { tiles, entries });
+        }
+        let index = StoreIndex {
+            version: STORE_VERSION,
+            crs: "LOCAL".to_owned(),
+            height_datum: HeightDatum::Unknown,
+            earth_radius_m: None,
+            layers: vec![layer],
+            report: ImportReport::default(),
+        };
+        index.check().unwrap();
+        let bytes = postcard::to_stdvec(&index).unwrap();
+        let index_hash = hash_of(&bytes);
+        blobs.insert(index_hash, bytes);
+        Terrain { index: Arc::new(index), index_hash, blobs }
     }
 
     pub fn open(&self, shot: u64, samples_per_side: u32) -> OpenShot {
@@ -73,6 +70,7 @@ impl Terrain {
             check: Share::NONE,
             width: SIZE.0,
             height: SIZE.1,
+            live: false,
         }
     }
 
@@ -93,6 +91,22 @@ impl Terrain {
         assert!(rendered.stats.hits > 0, "the test sees the ground");
         rendered.pixels
     }
+}
+
+fn tile(level: usize, (tx, ty): (u32, u32), blobs: &mut BTreeMap<BlobHash, Vec<u8>>) -> TileEntry {
+    let side = TILE_POSTS as i64;
+    let post = |at: i64| {
+        let (i, j) = (at % side - 1, at / side - 1);
+        let (i, j) = (i + i64::from(tx) * 256, j + i64::from(ty) * 256);
+        height(i << level, j << level)
+    };
+    let posts: Vec<f32> = (0..side * side).map(post).collect();
+    let bytes = encode_heights(&posts, Some(1.0));
+    let hash = hash_of(&bytes);
+    let length = bytes.len() as u32;
+    blobs.insert(hash, bytes);
+    // Bounds wider than the tile's own are allowed; they only cost steps.
+    TileEntry { hash, offset: 4096, length, min: 0.0, max: 1000.0, deviation: 1000.0 }
 }
 
 fn shading() -> Shading {

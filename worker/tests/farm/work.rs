@@ -71,6 +71,57 @@ async fn the_errors_of_parts_are_those_of_the_whole_and_exact_has_none() {
 }
 
 #[tokio::test]
+async fn a_live_job_shows_coarser_ground_at_once_and_a_later_one_what_has_come_since() {
+    let terrain = Terrain::new();
+    let coordinator = Coordinator::new().await;
+    let _running = start(coordinator.config(None));
+    let mut peer = coordinator.welcome().await;
+    peer.send(OpenShot { live: true, ..terrain.open(1, 1) }).await;
+    peer.send(grant(1, 1, whole())).await;
+    let roots = terrain.index.roots().into_iter();
+    let mut given: Vec<_> = roots.map(|root| terrain.index.entry(root).unwrap().hash).collect();
+    given.push(terrain.index_hash);
+    let mut held_back = Vec::new();
+    let done = loop {
+        match peer.recv().await {
+            Some(Message::WantBlobs(want)) => {
+                for hash in want.hashes {
+                    match given.contains(&hash) {
+                        true => {
+                            let bytes = terrain.blobs[&hash].clone().into();
+                            peer.send(Blob { hash, bytes }).await;
+                        }
+                        false => held_back.push(hash),
+                    }
+                }
+            }
+            Some(Message::Done(done)) => break done,
+            other => panic!("{other:?}"),
+        }
+    };
+    let area = whole().area();
+    assert!(done.report.coarser > 0 && done.report.coarser <= area, "{:?}", done.report);
+    let expected = terrain.expected(&grant(0, 1, whole()), 1);
+    let coarse = done.pixels.unpack(area as usize * 3).unwrap();
+    assert!(coarse != expected, "the tiles are needed");
+    assert!(!held_back.is_empty());
+    for hash in held_back {
+        peer.send(Blob { hash, bytes: terrain.blobs[&hash].clone().into() }).await;
+    }
+    // What lay hidden behind coarser ground may lack a tile in its turn.
+    for lease in 2..10 {
+        peer.send(grant(lease, 1, whole())).await;
+        let Some(Message::Done(done)) = peer.serve(&terrain).await else { panic!("no pixels") };
+        if done.report.coarser == 0 {
+            let pixels = done.pixels.unpack(area as usize * 3).unwrap();
+            assert!(pixels == expected, "the picture that waits for all");
+            return;
+        }
+    }
+    panic!("still coarser");
+}
+
+#[tokio::test]
 async fn a_second_start_finds_its_terrain_on_disk() {
     let terrain = Terrain::new();
     let folder = tempfile::tempdir().unwrap();

@@ -33,6 +33,9 @@ pub struct OpenShot {
     pub width: u32,
     /// Height of its frames, pixels.
     pub height: u32,
+    /// Somebody waits for its frames: terrain that is not on the worker's PC is not waited
+    /// for, but shown coarser.
+    pub live: bool,
 }
 
 /// Twin of [`OpenShot`].
@@ -44,6 +47,7 @@ pub(crate) struct OpenShotTwin {
     quality: QualityTwin,
     check: ShareTwin,
     size: [u32; 2],
+    live: bool,
 }
 
 impl Body for OpenShot {
@@ -57,6 +61,7 @@ impl Body for OpenShot {
             quality: self.quality.into(),
             check: self.check.into(),
             size: [self.width, self.height],
+            live: self.live,
         }
     }
 
@@ -69,6 +74,7 @@ impl Body for OpenShot {
             check: wire.check.try_into()?,
             width: wire.size[0],
             height: wire.size[1],
+            live: wire.live,
         })
     }
 
@@ -229,6 +235,9 @@ pub struct RenderReport {
     pub steps: u64,
     /// Samples that the method could not do its own way and gave a ray of their own.
     pub fallbacks: u64,
+    /// Pixels that show coarser terrain than was asked for, because it had not come: in live
+    /// shots only.
+    pub coarser: u64,
     /// Whether the camera was below the ground.
     pub below_ground: bool,
 }

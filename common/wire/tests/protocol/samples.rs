@@ -42,6 +42,7 @@ fn report() -> RenderReport {
         rays: 2_073_600,
         steps: 1 << 33,
         fallbacks: 64_282,
+        coarser: 700,
         below_ground: true,
     }
 }
@@ -115,6 +116,7 @@ pub fn all() -> Vec<(String, Message)> {
             check: share,
             width: 1920,
             height: 1080,
+            live: true,
         }
         .into(),
         Grant {
@@ -316,7 +318,17 @@ pub fn any_message() -> impl Strategy<Value = Message> {
         |(shot, index, shading, quality, width)| {
             let shot = ShotId(shot);
             let check = Share::from_millionths(width).unwrap();
-            OpenShot { shot, index, shading, quality, check, width, height: 7 }.into()
+            OpenShot {
+                shot,
+                index,
+                shading,
+                quality,
+                check,
+                width,
+                height: 7,
+                live: width % 2 == 1,
+            }
+            .into()
         },
     );
     let grant = (any::<[u64; 2]>(), any::<u32>(), any_camera(), any::<[prop::sample::Index; 4]>())
@@ -360,12 +372,15 @@ pub fn any_message() -> impl Strategy<Value = Message> {
         .prop_map(|(hash, workers)| Elsewhere { hash, workers }.into());
     let blob = (any_hash(), prop::collection::vec(any::<u8>(), 0..5000))
         .prop_map(|(hash, bytes)| Blob { hash, bytes: bytes.into() }.into());
-    let done = (any::<[u64; 5]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
-        .prop_map(|([lease, cost_us, rays, steps, fallbacks], below_ground, pixels, check)| {
-            let report = RenderReport { cost_us, rays, steps, fallbacks, below_ground };
-            let timesheet = Timesheet { idle_us: cost_us, redo_us: steps, ..timesheet() };
-            Done { lease: LeaseId(lease), report, timesheet, check, pixels }.into()
-        });
+    let done = (any::<[u64; 6]>(), any::<bool>(), any_pixels(), prop::option::of(any_errors()))
+        .prop_map(
+            |([lease, cost_us, rays, steps, fallbacks, coarser], below_ground, pixels, check)| {
+                let report =
+                    RenderReport { cost_us, rays, steps, fallbacks, coarser, below_ground };
+                let timesheet = Timesheet { idle_us: cost_us, redo_us: steps, ..timesheet() };
+                Done { lease: LeaseId(lease), report, timesheet, check, pixels }.into()
+            },
+        );
     let failed = (any::<u64>(), ".{0,300}")
         .prop_map(|(lease, reason)| Failed { lease: LeaseId(lease), reason }.into());
     let hand_back = prop::collection::vec(any::<u64>().prop_map(LeaseId), 0..50)

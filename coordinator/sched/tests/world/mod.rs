@@ -96,6 +96,11 @@ impl World {
 
     /// A shot whose frames take a worker of speed 1 so long, microseconds.
     pub fn submit(&mut self, shot: u64, frames: u32, priority: i32, frame_us: f64) {
+        self.submit_as(shot, frames, priority, frame_us, false);
+    }
+
+    /// The same, and whether somebody waits for each frame.
+    pub fn submit_as(&mut self, shot: u64, frames: u32, priority: i32, frame_us: f64, live: bool) {
         let shot = ShotId(shot);
         let (width, height) = SIZE;
         self.px_us.insert(shot, frame_us / f64::from(width * height));
@@ -107,7 +112,7 @@ impl World {
             split: Split::Columns,
             priority,
             frames_in_flight: 64,
-            live: false,
+            live,
         });
     }
 

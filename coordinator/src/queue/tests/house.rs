@@ -185,7 +185,7 @@ async fn paint(line: FarmLine, worker: WorkerId, log: Log, permits: Arc<Semaphor
 
 fn done(grant: &Grant, number: FrameIndex, fault: u8) -> Done {
     let pixels = vec![number as u8 ^ fault; grant.region.area() as usize * 3];
-    let report = RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
+    let report = RenderReport { cost_us: 10, rays: 1, steps: 1, ..RenderReport::default() };
     let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
     let timesheet = Timesheet::default();
     Done { lease: grant.lease, report, timesheet, check: None, pixels }

@@ -43,6 +43,7 @@ fn entry(index: FrameIndex) -> FrameEntry {
         render_ms: 2.5,
         jobs: 1,
         fallbacks: 0,
+        coarser_pixels: 0,
         fallback_share: 0.0,
         below_ground: false,
         error_px_p99: None,
