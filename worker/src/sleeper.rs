@@ -6,7 +6,7 @@
 //! sleeper keeps time: how long it had a job in hand, and how long it waited from each
 //! result to the next job.
 
-use crate::CONNECT_LIMIT;
+use crate::dial::CONNECT_LIMIT;
 use bytes::Bytes;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
