@@ -291,7 +291,7 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     Ok(Site {
         pool,
         cache,
-        cache_fails: Arc::default(),
+        cache_failed: Arc::default(),
         terrain,
         caster,
         gate,

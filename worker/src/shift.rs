@@ -36,7 +36,7 @@ use terrafarm_wire::pixels::Pixels;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tracing::{debug, info, warn};
+use tracing::{debug, warn};
 
 /// Small messages that may wait for the writer.
 const URGENT_MAX: usize = 256;
@@ -49,8 +49,8 @@ const REPORTS_MAX: usize = 64;
 pub(crate) struct Site<C: Caster> {
     pub pool: ThreadPool,
     pub cache: Option<Arc<BlobCache>>,
-    /// Whether it could not keep the blob that came last.
-    pub cache_fails: Arc<AtomicBool>,
+    /// Whether it has failed to keep a blob.
+    pub cache_failed: Arc<AtomicBool>,
     pub terrain: Terrain<C::Prepared>,
     pub caster: Arc<C>,
     pub gate: Gate,
@@ -293,7 +293,7 @@ impl<'a, C: Caster> Shift<'a, C> {
     fn take(&mut self, blob: Blob) -> Option<Event> {
         let Blob { hash, bytes } = blob;
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
-        let (cache, fails) = (self.site.cache.clone(), self.site.cache_fails.clone());
+        let (cache, failed) = (self.site.cache.clone(), self.site.cache_failed.clone());
         self.spawn(
             move || {
                 counted(&unpacking_ns, || {
@@ -302,7 +302,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                     }
                     let report = decoded(&*caster, hash, &bytes);
                     if !matches!(report, Report::Spoiled(..)) {
-                        keep(cache.as_deref(), &fails, &hash, &bytes);
+                        keep(cache.as_deref(), &failed, &hash, &bytes);
                     }
                     report
                 })
@@ -494,20 +494,15 @@ fn read(cache: &BlobCache, hash: &BlobHash) -> Option<Vec<u8>> {
     found
 }
 
-/// Keeps a blob on disk, if there is a cache. `fails` is whether the one before could not be:
-/// a disk that is full for a night is worth a line, not one for each tile.
-fn keep(cache: Option<&BlobCache>, fails: &AtomicBool, hash: &BlobHash, bytes: &[u8]) {
-    match cache.map(|cache| cache.put(hash, bytes)) {
-        None => {}
-        Some(Ok(())) => {
-            if fails.swap(false, Ordering::Relaxed) {
-                info!("terrain is kept on disk again");
-            }
-        }
-        Some(Err(error)) if !fails.swap(true, Ordering::Relaxed) => {
+/// Keeps a blob on disk, if there is a cache. A disk that has `failed` once is not spoken of
+/// again: one that is full for a night, and takes a small tile now and then, is worth a line.
+fn keep(cache: Option<&BlobCache>, failed: &AtomicBool, hash: &BlobHash, bytes: &[u8]) {
+    if let Some(Err(error)) = cache.map(|cache| cache.put(hash, bytes)) {
+        if failed.swap(true, Ordering::Relaxed) {
+            debug!(%error, "a terrain blob was not kept");
+        } else {
             warn!(%error, "terrain is not kept on disk, and fetched anew when it is needed again");
         }
-        Some(Err(error)) => debug!(%error, "a terrain blob was not kept"),
     }
 }
 
