@@ -101,6 +101,7 @@ async fn fly(
         share: ShareTiles::Never,
         reconnect: Reconnect::NEVER,
         seed: 1,
+        identity: 0,
     };
     let worker = tokio::spawn(run(config, std::future::pending()));
     let (stream, _) = listener.accept().await.expect("a worker");

@@ -72,7 +72,8 @@ impl Dial {
 /// What a worker says of itself.
 pub(crate) fn hello(config: &WorkerConfig) -> Hello {
     let threads = config.threads.max(1) as u32;
-    Hello::new(&config.name, Role::Worker { threads, incarnation: config.seed })
+    let WorkerConfig { seed: incarnation, identity, .. } = *config;
+    Hello::new(&config.name, Role::Worker { threads, incarnation, identity })
 }
 
 /// What is needed to open a line.

@@ -75,6 +75,9 @@ pub struct WorkerConfig {
     /// A number of this process: the worker's incarnation and the seed of its back-off.
     /// Two workers should have different ones.
     pub seed: u64,
+    /// A number of this PC that outlives the process; 0 if there is none. A coordinator that
+    /// has found wrong pixels knows the PC by it.
+    pub identity: u128,
 }
 
 /// Whether a worker gives its tiles to others of its farm, which spares the coordinator's

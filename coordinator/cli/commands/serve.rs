@@ -1,7 +1,7 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
 use crate::secret::{self, Source};
-use crate::{Outcome, args, files, lan, notify};
+use crate::{Outcome, args, files, identity, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -193,6 +193,8 @@ fn quoted(path: &str) -> String {
 /// Works until Ctrl-C or SIGTERM, or with `--once` until the coordinator goes away.
 pub fn worker(args: args::serve::Worker) -> anyhow::Result<Outcome> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+    let cache_dir =
+        (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir));
     let config = WorkerConfig {
         trust: secret::to_connect(&args.security)?,
         coordinator: match &args.coordinator {
@@ -201,7 +203,8 @@ pub fn worker(args: args::serve::Worker) -> anyhow::Result<Outcome> {
         },
         name: args.name.unwrap_or_else(pc_name),
         threads: args.threads.unwrap_or(cores) as usize,
-        cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
+        identity: cache_dir.as_deref().map_or(0, |folder| identity::of_this_pc(folder, &pc_name())),
+        cache_dir,
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
         share: match args.share_port {

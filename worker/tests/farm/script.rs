@@ -66,6 +66,7 @@ impl Coordinator {
                 longest: Duration::from_millis(5),
             },
             seed: 5,
+            identity: 7,
         }
     }
 
