@@ -14,6 +14,11 @@ mod tidy;
 #[path = "whole/farm.rs"]
 mod farm;
 
+/// While somebody waits for frames, a worker that freezes is noticed within half a second.
+#[cfg(unix)]
+#[path = "whole/live.rs"]
+mod live;
+
 /// Twenty times kill -9.
 #[path = "whole/faults.rs"]
 mod faults;

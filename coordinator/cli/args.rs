@@ -119,6 +119,11 @@ pub struct Render {
     /// Threads of each local worker [default: the cores shared out]
     #[arg(long, conflicts_with = "coordinator", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Somebody waits for each frame: a worker that died or froze is noticed within half a
+    /// second instead of five, and its jobs go to others; one that only stutters is dropped
+    /// and comes back
+    #[arg(long)]
+    pub live: bool,
     /// Who encodes MP4
     #[arg(long, value_enum, default_value_t = Encoder::Builtin)]
     pub encoder: Encoder,

@@ -68,6 +68,8 @@ pub struct Plan {
     pub frames_in_flight: u32,
     /// Shots of a higher priority come first.
     pub priority: i32,
+    /// Whether somebody waits for each frame.
+    pub live: bool,
     /// Where the pictures go.
     pub output: PathBuf,
     /// Who compresses video.
@@ -144,6 +146,7 @@ impl Plan {
             fps: choice.fps,
             frames_in_flight: FRAMES_IN_FLIGHT,
             priority: 0,
+            live: false,
             output: PathBuf::from("."),
             encoder: Encoder::BuiltIn,
             poster: None,
@@ -248,6 +251,7 @@ pub async fn carry_out(plan: Plan) -> anyhow::Result<Report> {
         cameras: plan.cameras.clone(),
         frames_in_flight: plan.frames_in_flight,
         priority: plan.priority,
+        live: plan.live,
     };
     let deserted = farm.as_ref().map_or_else(CancellationToken::new, |farm| farm.deserted.clone());
     let give_up = tokio::spawn({

@@ -9,11 +9,13 @@
 //! | `board` | the shots and workers that there are, chosen and in order |
 //! | `shots`, `workers`, `files`, `live`, `metrics`, `page` | the routes |
 //! | `refusal` | errors, as JSON with a status |
+//! | `budget` | memory for bodies |
 //! | `access` | who may ask by HTTP: hosts, origins, keys |
 //! | `serve`, `carry` | the two carriers |
 
 mod access;
 mod board;
+mod budget;
 mod carry;
 mod files;
 mod live;
@@ -28,7 +30,8 @@ mod workers;
 pub use access::{Access, WebKey};
 pub use serve::Web;
 
-pub(crate) use carry::answer;
+pub(crate) use budget::Budget;
+pub(crate) use carry::Link;
 pub(crate) use serve::serve;
 
 use crate::driver::FarmLine;
@@ -52,8 +55,6 @@ use tokio_util::sync::CancellationToken;
 const ORDER_BYTES_MAX: usize = 4 << 10;
 /// Longest list of blobs, bytes.
 const HASHES_BYTES_MAX: usize = 8 << 20;
-/// Long bodies (blobs and shots) that are taken at once: what they may take of memory.
-const BULKY_AT_ONCE: usize = 4;
 /// Pictures that are read from the disk and made small at once: the largest takes 0.8 GB.
 const PREVIEWS_AT_ONCE: usize = 2;
 /// How long an order may take, its body included.
@@ -69,7 +70,7 @@ pub struct Desk {
     thumbnails: Arc<Thumbnails>,
     stop: CancellationToken,
     board: Mutex<Option<Arc<Board>>>,
-    bulky: Semaphore,
+    budget: Budget,
     previews: Arc<Semaphore>,
     streams: Arc<Semaphore>,
 }
@@ -82,6 +83,7 @@ impl Desk {
         farm: FarmLine,
         queue: Option<Queue>,
         thumbnails: Arc<Thumbnails>,
+        budget: Budget,
         stop: CancellationToken,
     ) -> Arc<Self> {
         Arc::new(Desk {
@@ -91,7 +93,7 @@ impl Desk {
             thumbnails,
             stop,
             board: Mutex::default(),
-            bulky: Semaphore::new(BULKY_AT_ONCE),
+            budget,
             previews: Arc::new(Semaphore::new(PREVIEWS_AT_ONCE)),
             streams: Arc::new(Semaphore::new(live::STREAMS_MAX)),
         })
@@ -147,7 +149,7 @@ pub(crate) fn router(desk: Arc<Desk>) -> Router {
             put(shots::put_blob).layer(DefaultBodyLimit::max(BLOB_BYTES_MAX)),
         )
         .route("/api/v1/shots", post(shots::submit).layer(DefaultBodyLimit::max(DESK_BODY_MAX)))
-        .layer(middleware::from_fn_with_state(desk.clone(), shots::one_of_few))
+        .layer(middleware::from_fn_with_state(desk.clone(), shots::within_budget))
         .layer(middleware::from_fn(|request, next| in_time(BULKY_LIMIT, request, next)));
     orders
         .merge(bulky)
@@ -160,4 +162,33 @@ pub(crate) fn router(desk: Arc<Desk>) -> Router {
 async fn in_time(limit: Duration, request: Request, next: Next) -> Response {
     let answered = tokio::time::timeout(limit, next.run(request)).await;
     answered.unwrap_or_else(|_| Refusal::too_slow(limit).into_response())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::body::Body;
+    use axum::http::{StatusCode, header};
+    use tower::ServiceExt;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_long_body_for_which_there_is_no_memory_is_refused_with_when_to_come_back() {
+        let budget = Budget::new(4 << 20, Duration::from_secs(60));
+        let (farm, stop) = (FarmLine::to_nobody(), CancellationToken::new());
+        let desk = Desk::new("test", farm, None, Arc::default(), budget.clone(), stop);
+        let routes = router(desk);
+        let post = async |length: usize| {
+            let body = Body::from(vec![b' '; length]);
+            let request = Request::post("/api/v1/shots").body(body).expect("a request");
+            routes.clone().oneshot(request).await.expect("an answer")
+        };
+        let others = budget.claim(3 << 20).await.expect("room");
+        let refused = post(2 << 20).await;
+        assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert_eq!(refused.headers()[header::RETRY_AFTER], "5");
+        // There is no queue: that is an answer.
+        assert_eq!(post(1000).await.status(), StatusCode::NOT_IMPLEMENTED);
+        drop(others);
+        assert_eq!(post(2 << 20).await.status(), StatusCode::NOT_IMPLEMENTED);
+    }
 }

@@ -59,6 +59,8 @@ pub struct Submission {
     pub frames_in_flight: u32,
     /// Shots of a higher priority come first.
     pub priority: i32,
+    /// Whether somebody waits for each frame.
+    pub live: bool,
 }
 
 /// What comes back while a shot is rendered.
@@ -434,6 +436,7 @@ impl Submission {
             frames: frames.len() as u32,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
+            live: self.live,
         };
         let cameras = frames.iter().map(|&frame| self.cameras[frame as usize]).collect();
         Plan { submit, cameras }

@@ -4,7 +4,7 @@
 //! wait, and TCP slows the senders down. Each peer's outbox is bounded; a peer whose
 //! outbox is full does not read, and is dropped.
 
-use crate::api::{self, Desk, Web};
+use crate::api::{self, Budget, Desk, Link, Web};
 use crate::blobs::ClientId;
 use crate::farm::{Farm, Greeting, Out, Peer, PeerEvent};
 use crate::journal::{self, Journal, JournalError};
@@ -52,6 +52,14 @@ pub struct Config {
     pub redirect_above_bytes: u64,
     /// Most connections at once, greeting or greeted.
     pub connections_max: usize,
+    /// Most desks at once, each a line of someone who asks the API; others wait for their
+    /// turn.
+    pub desks_max: usize,
+    /// Most bytes of long bodies of the API in memory at once, of requests and of answers to
+    /// desks.
+    pub bodies_bytes_max: usize,
+    /// How long a body waits for memory before it is turned away.
+    pub bodies_patience: Duration,
     /// Whom it lets in.
     pub trust: Trust,
     /// Most connections that have not greeted yet; the oldest of them gives way to a new
@@ -76,6 +84,9 @@ impl Default for Config {
             blob_memory_bytes: 512 << 20,
             redirect_above_bytes: 8 << 20,
             connections_max: 16_896,
+            desks_max: 128,
+            bodies_bytes_max: 512 << 20,
+            bodies_patience: Duration::from_secs(60),
             trust: Trust::Loopback,
             strangers_max: 256,
             greeting_limit: Duration::from_secs(5),
@@ -189,11 +200,12 @@ impl Coordinator {
             mind = mind.recorded_in(journal);
         }
         let driver = tasks.spawn(drive(mind, inbox, sight, stop.clone()));
-        let desk = Desk::new(&config.name, farm, queue, thumbnails, stop.clone());
+        let budget = Budget::new(config.bodies_bytes_max, config.bodies_patience);
+        let desk = Desk::new(&config.name, farm, queue, thumbnails, budget, stop.clone());
         if let Some(web) = web {
             tasks.spawn(api::serve(web, desk.clone(), stop.clone()));
         }
-        let admission = Admission::new(&config, events, api::router(desk), unsent, stop.clone());
+        let admission = Admission::new(&config, events, Link::new(desk), unsent, stop.clone());
         admit(&listener, &admission, &tasks, shutdown).await;
         stop.cancel();
         // The admission holds a way to the driver; the driver ends when the last one is gone.

@@ -46,6 +46,8 @@ pub enum PeerEvent {
     Joined(Greeting),
     /// A message came.
     Said(Message),
+    /// More came of a message that is not whole yet.
+    Stirred,
     /// The queue on disk submits a shot.
     Adopt(Box<Adoption>),
     /// The connection has ended; why, in words.

@@ -1,27 +1,28 @@
 //! Ways in for the fuzz targets of `tests/fuzz`, and for nobody else: what they are to feed
 //! is private, and stays so.
 
+use crate::api::{Budget, Desk, Link};
 use crate::driver::FarmLine;
 use crate::queue;
-use axum::Router;
+use std::time::Duration;
 use terrafarm_wire::message::{Request, Response};
 use tokio_util::sync::CancellationToken;
 
 /// The API of a coordinator whose farm has ended and that has no queue.
-pub struct Api(Router);
+pub struct Api(Link);
 
 impl Default for Api {
     fn default() -> Self {
         let (line, stop) = (FarmLine::to_nobody(), CancellationToken::new());
-        let desk = crate::api::Desk::new("fuzz", line, None, Default::default(), stop);
-        Api(crate::api::router(desk))
+        let budget = Budget::new(1 << 20, Duration::ZERO);
+        Api(Link::new(Desk::new("fuzz", line, None, Default::default(), budget, stop)))
     }
 }
 
 impl Api {
     /// Answers a request as it comes over the encrypted link.
     pub async fn answer(&self, request: Request) -> Response {
-        crate::api::answer(&self.0, request).await
+        self.0.answer(request, None).await.0
     }
 }
 

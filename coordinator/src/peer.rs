@@ -1,19 +1,21 @@
 //! One connection: greeting, then one task that reads and one that writes.
 
-use crate::api;
+use crate::api::Link;
 use crate::driver::{Config, ToDriver, peer_of};
 use crate::farm::{Greeting, PeerEvent};
 use crate::strangers::Strangers;
-use axum::Router;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use terrafarm_sched::LostReason;
-use terrafarm_wire::link::{self, Connection, HandshakeError, LinkError, Meter, Trust, handshake};
+use terrafarm_wire::link::{
+    self, Connection, HandshakeError, Heard, LinkError, Meter, Trust, handshake,
+};
 use terrafarm_wire::message::{Message, Pong, Refusal, Role};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 /// Messages that may wait for a peer on each lane: grants and questions on one, blobs and
@@ -24,8 +26,8 @@ const BULK_QUEUE: usize = 4096;
 /// A client is given up after this many times the silence that a worker may keep.
 const CLIENT_PATIENCE: u32 = 4;
 
-/// Desks at once: each may be sending something long.
-const DESKS_MAX: usize = 32;
+/// How long a long body may take to come when there is memory for it.
+const BODY_LIMIT: Duration = Duration::from_secs(600);
 /// How long a desk may take to take an answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 
@@ -42,7 +44,7 @@ pub struct Admission {
     last_id: Arc<AtomicU64>,
     events: mpsc::Sender<ToDriver>,
     /// What answers desks, and how many more there may be.
-    api: Router,
+    api: Link,
     desks: Arc<Semaphore>,
     stop: CancellationToken,
     /// Of what waits for links to workers.
@@ -62,7 +64,7 @@ impl Admission {
     pub fn new(
         config: &Config,
         events: mpsc::Sender<ToDriver>,
-        api: Router,
+        api: Link,
         unsent: Meter,
         stop: CancellationToken,
     ) -> Self {
@@ -77,7 +79,7 @@ impl Admission {
             last_id: Arc::default(),
             events,
             api,
-            desks: Arc::new(Semaphore::new(DESKS_MAX)),
+            desks: Arc::new(Semaphore::new(config.desks_max)),
             stop,
             unsent,
         }
@@ -109,6 +111,17 @@ pub async fn serve(
         let text = "a coordinator serves workers and clients; a peer asks workers";
         return greeted.refuse(Refusal::Malformed, text).await;
     }
+    let place = match greeted.hello().role {
+        Role::Desk => match place(&admission).await {
+            Some(place) => Some(place),
+            None => {
+                let text = "as many are served at the desk as there are places; try again in a \
+                            moment";
+                return greeted.refuse(Refusal::Full, text).await;
+            }
+        },
+        _ => None,
+    };
     let id = admission.last_id.fetch_add(1, Ordering::Relaxed) + 1;
     let welcomed = greeted.welcome(id, &admission.name, admission.heartbeat, admission.silence);
     let (connection, hello) = match welcomed.await {
@@ -121,7 +134,10 @@ pub async fn serve(
     let (is_worker, threads, identity) = match hello.role {
         Role::Worker { threads, identity, .. } => (true, threads, identity),
         Role::Client | Role::Peer => (false, 0, 0),
-        Role::Desk => return desk(connection, &admission).await,
+        Role::Desk => {
+            desk(connection, &admission).await;
+            return drop(place);
+        }
     };
     let peer = peer_of(id, is_worker);
     let (mut reader, writer) = connection.split();
@@ -138,24 +154,26 @@ pub async fn serve(
     }
     // Workers are the scheduler's to watch, which probes them. A client pings by itself;
     // one that is silent for so long is gone, and its shots hold the farm for nobody.
-    let patience = admission.silence * CLIENT_PATIENCE;
+    let patience = (!is_worker).then_some(admission.silence * CLIENT_PATIENCE);
     let mut leaving = false;
     let how = loop {
         tokio::select! {
             () = hang_up.cancelled() => break Ok(()),
-            received = async {
-                if is_worker { reader.recv().await } else { reader.recv_within(patience).await }
-            } => match received {
-                Ok(Some(message)) => {
-                    leaving |= matches!(message, Message::Goodbye(_));
-                    let event = ToDriver::Event(peer, PeerEvent::Said(message));
-                    if admission.events.send(event).await.is_err() {
-                        break Ok(());
+            heard = reader.hear(patience) => {
+                let event = match heard {
+                    Ok(Heard::Message(message)) => {
+                        leaving |= matches!(message, Message::Goodbye(_));
+                        PeerEvent::Said(message)
                     }
+                    Ok(Heard::More) if is_worker => PeerEvent::Stirred,
+                    Ok(Heard::More | Heard::Claim(_)) => continue,
+                    Ok(Heard::End) => break Ok(()),
+                    Err(why) => break Err(why),
+                };
+                if admission.events.send(ToDriver::Event(peer, event)).await.is_err() {
+                    break Ok(());
                 }
-                Ok(None) => break Ok(()),
-                Err(why) => break Err(why),
-            },
+            }
         }
     };
     let (reason, text) = match how {
@@ -173,22 +191,56 @@ pub async fn serve(
     }
 }
 
+/// A place at the desk, for which whoever comes waits for a moment; `None` if all stay taken.
+async fn place(admission: &Admission) -> Option<OwnedSemaphorePermit> {
+    // The other side gives up a greeting that takes too long.
+    let patience = admission.greeting_limit / 2;
+    tokio::select! {
+        () = admission.stop.cancelled() => None,
+        taken = tokio::time::timeout(patience, admission.desks.clone().acquire_owned()) => {
+            taken.ok()?.ok()
+        }
+    }
+}
+
+async fn sleep_until(due: Option<Instant>) {
+    match due {
+        // Someone who sends a byte now and then holds memory that others wait for.
+        Some(due) => tokio::time::sleep_until(due).await,
+        None => std::future::pending().await,
+    }
+}
+
 /// Answers the requests of one desk, one after the other.
 async fn desk(connection: Connection<TcpStream>, admission: &Admission) {
-    // Whoever comes when all places are taken is hung up on, and tries again.
-    let Ok(_place) = admission.desks.try_acquire() else { return };
     let (mut reader, mut writer) = connection.split();
     let patience = admission.silence * CLIENT_PATIENCE;
+    // Of the body that is coming, and when it has to be there.
+    let (mut share, mut due) = (None, None::<Instant>);
     loop {
         let received = tokio::select! {
             () = admission.stop.cancelled() => return,
-            received = reader.recv_within(patience) => received,
+            () = sleep_until(due) => return,
+            received = reader.hear(Some(patience)) => received,
         };
-        let answer: Message = match received {
-            Ok(Some(Message::Request(request))) => {
-                api::answer(&admission.api, request).await.into()
+        let (answer, _claim): (Message, _) = match received {
+            Ok(Heard::More) => continue,
+            Ok(Heard::Claim(bytes)) => {
+                let claim = tokio::select! {
+                    () = admission.stop.cancelled() => return,
+                    claim = admission.api.claim(bytes) => claim,
+                };
+                // There is no request yet that could be answered.
+                let Some(claim) = claim else { return };
+                (share, due) = (Some(claim), Some(Instant::now() + BODY_LIMIT));
+                continue;
             }
-            Ok(Some(Message::Ping(ping))) => Pong { number: ping.number }.into(),
+            Ok(Heard::Message(Message::Request(request))) => {
+                due = None;
+                let (response, claim) = admission.api.answer(request, share.take()).await;
+                (response.into(), claim)
+            }
+            Ok(Heard::Message(Message::Ping(ping))) => (Pong { number: ping.number }.into(), None),
             _ => return,
         };
         match tokio::time::timeout(ANSWER_LIMIT, writer.send(&answer)).await {

@@ -17,8 +17,8 @@
 //! a crash costs the frame: it is rendered again and written over.
 //!
 //! [`Queue`] is the handle; [`QueueTask`] does the work. Within: `plan` is what is
-//! submitted, `book` decides (pure), `ledger` keeps records, `blobs` terrain, `pictures`
-//! frames and films, `task` joins them.
+//! submitted, `book` decides (pure), `ledger` keeps records (`record`), `blobs` terrain,
+//! `pictures` frames and films, `task` joins them.
 
 mod blobs;
 mod book;
@@ -26,6 +26,7 @@ mod disk;
 mod ledger;
 mod pictures;
 mod plan;
+mod record;
 mod task;
 
 pub use plan::{Film, PIXELS_IN_FLIGHT_MAX, ShotPlan, Source, TEXT_BYTES_MAX, parse_hash};
@@ -40,6 +41,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use task::Task;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
+use terrafarm_terrain::store::hash_of;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -55,6 +57,11 @@ pub const MISSING_MAX: usize = 1 << 16;
 /// Commands that may wait for the task; further ones wait with whoever gives them.
 const COMMANDS: usize = 256;
 
+/// Longest key of a submission, bytes.
+pub const KEY_BYTES_MAX: usize = 128;
+/// How long keys of submissions are remembered, at least.
+pub const KEY_KEPT: Duration = Duration::from_secs(2 * 24 * 3600);
+
 /// Every shot of the queue, by number.
 pub type ShotList = Arc<Vec<Arc<ShotView>>>;
 
@@ -67,6 +74,8 @@ pub struct QueueConfig {
     pub reserve_bytes: u64,
     /// Terrain that no unfinished shot needs is kept up to this size, bytes.
     pub terrain_cache_bytes: u64,
+    /// How long it is kept at most after it came or was asked for.
+    pub terrain_kept: Duration,
     /// How long terrain is kept in any case after it came or was asked for: a submission
     /// may be on its way.
     pub terrain_grace: Duration,
@@ -83,6 +92,7 @@ impl QueueConfig {
             folder: folder.into(),
             reserve_bytes: 256 << 20,
             terrain_cache_bytes: 8 << 30,
+            terrain_kept: Duration::from_secs(14 * 24 * 3600),
             terrain_grace: Duration::from_secs(3600),
             retry: Duration::from_secs(3),
             active: 16,
@@ -151,6 +161,17 @@ pub enum QueueError {
         /// What it is.
         found: BlobHash,
     },
+    /// What was submitted under a key before is something else.
+    #[error(
+        "the key {key:?} was used for {shot}, which is another submission; use a new key for each shot, \
+         and the same one only to send the same again"
+    )]
+    KeyReused {
+        /// The key.
+        key: String,
+        /// What it stands for.
+        shot: ShotId,
+    },
     /// None of the queue's shots.
     #[error("there is no {0} in the queue; \"terrafarm shots\" lists those that are")]
     NoShot(ShotId),
@@ -187,6 +208,29 @@ pub enum QueueError {
 
 fn owner(pid: Option<u32>) -> String {
     pid.map_or("another coordinator".into(), |pid| format!("the coordinator with process {pid}"))
+}
+
+/// What makes a submission that is sent again the same one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SubmissionKey {
+    key: String,
+    /// SHA-256 of what was submitted.
+    content: BlobHash,
+}
+
+impl SubmissionKey {
+    /// The key of a submission with this content; drawn at random by whoever submits.
+    ///
+    /// # Errors
+    /// [`QueueError::Unfit`] unless it has 1 to [`KEY_BYTES_MAX`] visible ASCII characters.
+    pub fn new(key: &str, content: &[u8]) -> Result<Self, QueueError> {
+        let visible = key.bytes().all(|symbol| symbol.is_ascii_graphic());
+        if key.is_empty() || key.len() > KEY_BYTES_MAX || !visible {
+            let why = format!("its key has to have 1 to {KEY_BYTES_MAX} visible ASCII characters");
+            return Err(QueueError::Unfit(why));
+        }
+        Ok(SubmissionKey { key: key.to_owned(), content: hash_of(content) })
+    }
 }
 
 /// Where the files of a shot are, or will be.
@@ -238,7 +282,9 @@ pub struct Queue {
 
 /// What the task is told by handles.
 enum Command {
-    Submit(Box<ShotPlan>, oneshot::Sender<Result<ShotId, QueueError>>),
+    Submit(Box<ShotPlan>, Option<SubmissionKey>, oneshot::Sender<Result<ShotId, QueueError>>),
+    /// The shot of a submission that may have come before.
+    Recall(SubmissionKey, oneshot::Sender<Result<Option<ShotId>, QueueError>>),
     Order(Order, oneshot::Sender<Result<String, QueueError>>),
     /// A blob came that may have been missed.
     Came(BlobHash),
@@ -303,6 +349,28 @@ impl Queue {
     /// # Errors
     /// If it cannot be rendered, some of its terrain is not here, or there is no room.
     pub async fn submit(&self, plan: ShotPlan) -> Result<ShotId, QueueError> {
+        self.take(plan, None).await
+    }
+
+    /// As [`Queue::submit`], once for each key: who is not sure whether a submission has come
+    /// sends it again with its key, and gets the number of the shot that it was. Keys are
+    /// remembered for [`KEY_KEPT`] at least, restarts included.
+    ///
+    /// # Errors
+    /// As [`Queue::submit`], and [`QueueError::KeyReused`].
+    pub async fn submit_once(
+        &self,
+        plan: ShotPlan,
+        key: SubmissionKey,
+    ) -> Result<ShotId, QueueError> {
+        // First, since terrain and room may be gone that the shot had when it was taken.
+        match self.ask(|answer| Command::Recall(key.clone(), answer)).await? {
+            Some(shot) => Ok(shot),
+            None => self.take(plan, Some(key)).await,
+        }
+    }
+
+    async fn take(&self, plan: ShotPlan, key: Option<SubmissionKey>) -> Result<ShotId, QueueError> {
         let blobs = self.blobs.clone();
         let plan = blocking(move || {
             plan.check()?;
@@ -311,7 +379,7 @@ impl Queue {
             Ok(plan)
         });
         let plan = Box::new(plan.await?);
-        self.ask(|answer| Command::Submit(plan, answer)).await
+        self.ask(|answer| Command::Submit(plan, key, answer)).await
     }
 
     /// Carries out an order about a shot of the queue: pause, resume, cancel, priority,

@@ -15,6 +15,7 @@ use terrafarm_wire::limits::WORKER_SHARES_MAX;
 use terrafarm_wire::message::{
     Accepted, Cameras, Frame, RenderReport, ShotDone, Submit, Timesheet, WorkerShare,
 };
+use tokio::sync::mpsc;
 
 /// Most frames of all shots together: their cameras take about 0.5 GB.
 const CAMERAS_MAX: u64 = 4 << 20;
@@ -65,12 +66,20 @@ pub struct Shot {
     jobs_granted: u64,
     report: RenderReport,
     shares: BTreeMap<String, WorkerShare>,
+    /// Who has to hear of complete frames that are not believed any more.
+    doubts: Option<mpsc::UnboundedSender<Doubt>>,
 }
 
 impl Shot {
     /// The number of a frame within the flight, by which people know it.
     pub fn number(&self, frame: FrameIndex) -> FrameIndex {
         self.numbers.get(frame as usize).copied().unwrap_or(frame)
+    }
+
+    /// Says that complete frames have pixels of a worker that is not believed any more;
+    /// false if nobody is there to have them rendered again.
+    pub fn doubt(&self, doubt: Doubt) -> bool {
+        self.doubts.as_ref().is_some_and(|doubts| doubts.send(doubt).is_ok())
     }
 
     /// What the scheduler is told of it.
@@ -83,6 +92,7 @@ impl Shot {
             split: self.submit.split,
             priority: self.submit.priority,
             frames_in_flight: self.submit.frames_in_flight,
+            live: self.submit.live,
         }
     }
 }
@@ -123,6 +133,18 @@ pub struct Adoption {
     pub cameras: Vec<Camera>,
     /// The number of each frame within the flight: not all of it is always missing.
     pub numbers: Vec<FrameIndex>,
+    /// Where to say that complete frames are not believed any more: before anything that is
+    /// said of the shot later.
+    pub doubts: mpsc::UnboundedSender<Doubt>,
+}
+
+/// Complete frames with pixels of a worker that is not believed any more.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Doubt {
+    /// Its name.
+    pub worker: String,
+    /// The first and the last frame of each run, as the farm counts the shot's.
+    pub frames: Vec<(FrameIndex, FrameIndex)>,
 }
 
 impl Shots {
@@ -185,7 +207,7 @@ impl Shots {
         adoption: Adoption,
         now: Micros,
     ) -> Result<(Accepted, Event), String> {
-        let Adoption { shot, submit, cameras, numbers } = adoption;
+        let Adoption { shot, submit, cameras, numbers, doubts } = adoption;
         if self.shots.contains_key(&shot) {
             return Err(format!("{shot} is under way already"));
         }
@@ -203,6 +225,7 @@ impl Shots {
         state.queued = true;
         state.cameras = cameras;
         state.numbers = numbers;
+        state.doubts = Some(doubts);
         Ok((Accepted { number, shot }, state.submitted(shot)))
     }
 
@@ -246,6 +269,7 @@ impl Shots {
             jobs_granted: 0,
             report: RenderReport::default(),
             shares: BTreeMap::new(),
+            doubts: None,
             submit,
         };
         self.shots.entry(id).insert_entry(shot).into_mut()

@@ -185,6 +185,18 @@ pub struct ShotView {
     pub last_frame: Option<FrameIndex>,
     /// Whether there is a film to be fetched.
     pub film: bool,
+    /// What happened to it that people should know of, oldest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub history: Vec<Past>,
+}
+
+/// Something that happened to a shot.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Past {
+    /// When, seconds since 1970.
+    pub at_s: u64,
+    /// What, for people.
+    pub what: String,
 }
 
 impl ShotState {

@@ -3,16 +3,19 @@
 
 use crate::support::{Dir, Running, World, frame_hashes, run, succeed, terrafarm, worker};
 use glam::DVec3;
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
+use std::io::{BufRead, BufReader, Lines, Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::path::Path;
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::SeqCst};
 use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
+use terrafarm_coordinator::Config;
 use terrafarm_coordinator::ask::Line;
 use terrafarm_coordinator::queue::{ShotPlan, Source};
 use terrafarm_terrain::store::StoreReader;
@@ -73,20 +76,23 @@ impl Office {
         reply.json()
     }
 
-    /// Asks again and again until something holds of an answer.
+    /// Asks until something holds of an answer: again whenever an event says that something
+    /// has changed.
     pub fn wait(
         &self,
         path: &str,
         holds: impl Fn(&serde_json::Value) -> bool,
     ) -> serde_json::Value {
         let deadline = Instant::now() + PATIENCE;
+        // Before the first question, so that no change is missed.
+        let mut events = Events::open(&self.http, "");
         loop {
             let answer = self.json(path);
             if holds(&answer) {
                 return answer;
             }
             assert!(Instant::now() < deadline, "{path} stays {answer}");
-            std::thread::yield_now();
+            events.read();
         }
     }
 }
@@ -418,23 +424,39 @@ fn floods_of_silent_and_slow_connections_keep_nobody_out() {
     assert_eq!(http(&office.http, "GET", "/", &[("X-Long", &long)], b"").status, 431);
 }
 
-/// A stream of events: what it says first, and when.
-pub fn first_events(address: &str, query: &str) -> (Vec<(String, serde_json::Value)>, TcpStream) {
-    let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(stream, "GET /api/v1/events?{query} HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
-    let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
-    let (mut events, mut name) = (Vec::new(), String::new());
-    while events.len() < 3 {
-        let line = lines.next().expect("the stream goes on").unwrap();
-        if let Some(text) = line.strip_prefix("event: ") {
-            name = text.to_owned();
-        } else if let Some(text) = line.strip_prefix("data: ") {
-            events.push((name.clone(), serde_json::from_str(text).unwrap()));
-        }
-        assert!(!line.starts_with("HTTP/1.1 5"), "{line}");
+/// A stream of events.
+pub struct Events {
+    lines: Lines<BufReader<TcpStream>>,
+    name: String,
+}
+
+impl Events {
+    /// Asks for one.
+    pub fn open(address: &str, query: &str) -> Self {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(stream, "GET /api/v1/events?{query} HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+        Events { lines: BufReader::new(stream).lines(), name: String::new() }
     }
-    (events, stream)
+
+    /// Waits for the next one: its name and what it says.
+    pub fn read(&mut self) -> (String, serde_json::Value) {
+        loop {
+            let line = self.lines.next().expect("the stream goes on").unwrap();
+            assert!(!line.starts_with("HTTP/1.1 5"), "{line}");
+            if let Some(text) = line.strip_prefix("event: ") {
+                self.name = text.to_owned();
+            } else if let Some(text) = line.strip_prefix("data: ") {
+                return (self.name.clone(), serde_json::from_str(text).unwrap());
+            }
+        }
+    }
+}
+
+/// A stream of events, and what it says first.
+pub fn first_events(address: &str, query: &str) -> (Vec<(String, serde_json::Value)>, Events) {
+    let mut events = Events::open(address, query);
+    ((0..3).map(|_| events.read()).collect(), events)
 }
 
 #[test]
@@ -477,6 +499,111 @@ fn tiny(store: &StoreReader, number: u32) -> ShotPlan {
         film: None,
         source: Source::default(),
     }
+}
+
+/// A way to a coordinator that loses the first answer to a submission, and its line with it;
+/// says how often it has done so.
+fn lossy(coordinator: &str) -> (String, Arc<AtomicU32>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let (coordinator, losses) = (coordinator.to_owned(), Arc::new(AtomicU32::new(0)));
+    let lost = losses.clone();
+    std::thread::spawn(move || {
+        for near in listener.incoming() {
+            let (mut near, mut far) = (near.unwrap(), TcpStream::connect(&coordinator).unwrap());
+            let (mut from_far, mut to_near) = (far.try_clone().unwrap(), near.try_clone().unwrap());
+            let submitted = Arc::new(AtomicBool::new(false));
+            let (seen, lost) = (submitted.clone(), lost.clone());
+            std::thread::spawn(move || {
+                let mut bytes = [0; 1 << 16];
+                while let Ok(count @ 1..) = from_far.read(&mut bytes) {
+                    if seen.load(SeqCst) && lost.load(SeqCst) == 0 {
+                        lost.store(1, SeqCst);
+                        break;
+                    }
+                    if to_near.write_all(&bytes[..count]).is_err() {
+                        break;
+                    }
+                }
+                let _ = to_near.shutdown(Shutdown::Both);
+            });
+            std::thread::spawn(move || {
+                let mut bytes = [0; 1 << 16];
+                while let Ok(count @ 1..) = near.read(&mut bytes) {
+                    let text = b"idempotency_key";
+                    if bytes[..count].windows(text.len()).any(|some| some == text) {
+                        submitted.store(true, SeqCst);
+                    }
+                    if far.write_all(&bytes[..count]).is_err() {
+                        break;
+                    }
+                }
+                let _ = far.shutdown(Shutdown::Both);
+            });
+        }
+    });
+    (address, losses)
+}
+
+#[test]
+fn a_submission_whose_answer_is_lost_is_sent_again_and_is_one_shot() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let (address, losses) = lossy(&office.address);
+    let mut submit = terrafarm();
+    submit.arg("submit").arg(&world.scene).arg("--flight").arg(&world.flight).args(SIZE);
+    let (printed, said) = run(submit.args(["--coordinator", &address]), 0);
+    assert_eq!((losses.load(SeqCst), printed.trim()), (1, "1"), "{said}");
+    assert!(said.contains("was lost") && said.contains("waiting"), "{said}");
+    assert_eq!(office.json("/api/v1/shots")["total"], 1);
+}
+
+#[test]
+fn a_submission_with_a_key_is_one_shot_however_often_it_is_sent() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let first = office.submit(&world, &["--name", "first"]);
+    let store = StoreReader::open(&world.dir.path("land.terrain")).unwrap();
+    let body = serde_json::to_vec(&tiny(&store, 1)).unwrap();
+    let post = |path: &str, key: &str, body: &[u8]| {
+        http(&office.http, "POST", path, &[("Idempotency-Key", key)], body)
+    };
+    let path = "/api/v1/shots";
+    for key in ["night-7", "\"night-7\"", "night-7"] {
+        let reply = post(path, key, &body);
+        assert_eq!((reply.status, reply.json()["shot"].as_u64()), (200, Some(first + 1)));
+    }
+    let by_address =
+        http(&office.http, "POST", &format!("{path}?idempotency_key=night-7"), &[], &body);
+    assert_eq!(by_address.json()["shot"], first + 1);
+    assert_eq!(post(path, "night-8", &body).json()["shot"], first + 2);
+    let other = serde_json::to_vec(&tiny(&store, 2)).unwrap();
+    let reused = post(path, "night-7", &other);
+    assert_eq!(reused.status, 422, "{}", reused.text());
+    assert!(reused.text().contains("is another submission"), "{}", reused.text());
+    assert_eq!(post(path, "two words", &other).status, 400);
+    assert_eq!(post(&format!("{path}?idempotency_key=a"), "b", &other).status, 400);
+    assert_eq!(office.json(path)["total"], 3);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn whoever_comes_when_all_places_at_the_desk_are_taken_waits_for_its_turn() {
+    let world = World::new(300);
+    let office = office(&world.dir, &[]);
+    let mut lines = Vec::new();
+    for _ in 0..Config::default().desks_max {
+        lines.push(Line::open(&office.address, &Trust::Loopback).await.unwrap());
+    }
+    let mut submit = office.ask(&["submit"]);
+    submit.arg(&world.scene).arg("--flight").arg(&world.flight).args(SIZE);
+    let mut waiting = Running::start(&mut submit);
+    let said = waiting.expect("waiting, at most");
+    assert!(said.contains("as many are served at the desk as there are places"), "{said}");
+    assert_eq!(office.json("/api/v1/shots")["total"], 0);
+    // One place is enough, although others would be faster.
+    lines.pop();
+    let (code, said) = waiting.finish();
+    assert_eq!((code, said.last().map(String::as_str)), (Some(0), Some("1")), "{said:#?}");
 }
 
 /// Fills an office: so many shots, so many workers that sleep over their first job.

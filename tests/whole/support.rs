@@ -150,23 +150,33 @@ impl Running {
 
     /// Waits for a line that contains a text, and returns it.
     pub fn expect(&mut self, text: &str) -> String {
-        let deadline = Instant::now() + PATIENCE;
+        self.expect_one_of(&[text])
+    }
+
+    /// Waits for a line that contains one of these texts, and returns it.
+    pub fn expect_one_of(&mut self, texts: &[&str]) -> String {
+        self.seek(texts, PATIENCE).unwrap_or_else(|why| {
+            let how =
+                if why == RecvTimeoutError::Timeout { "did not come" } else { "ended before" };
+            panic!("{texts:?} {how}; lines so far:\n{}", self.seen.join("\n"));
+        })
+    }
+
+    /// Waits for a line that contains a text, but it need not come; `None` if it does not in
+    /// this time.
+    #[cfg(unix)]
+    pub fn expect_within(&mut self, text: &str, limit: Duration) -> Option<String> {
+        self.seek(&[text], limit).ok()
+    }
+
+    fn seek(&mut self, texts: &[&str], limit: Duration) -> Result<String, RecvTimeoutError> {
+        let deadline = Instant::now() + limit;
         loop {
-            match self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(line) => {
-                    self.seen.push(line.clone());
-                    if line.contains(text) {
-                        return line;
-                    }
-                }
-                Err(why) => {
-                    let how = if why == RecvTimeoutError::Timeout {
-                        "did not come"
-                    } else {
-                        "ended before"
-                    };
-                    panic!("{text:?} {how}; lines so far:\n{}", self.seen.join("\n"));
-                }
+            let left = deadline.saturating_duration_since(Instant::now());
+            let line = self.lines.recv_timeout(left)?;
+            self.seen.push(line.clone());
+            if texts.iter().any(|text| line.contains(text)) {
+                return Ok(line);
             }
         }
     }

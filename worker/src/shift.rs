@@ -28,7 +28,7 @@ use terrafarm_terrain::layout::TileKey;
 use terrafarm_terrain::resident::{Resident, Tile};
 use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::Message;
-use terrafarm_wire::link::{Connection, LinkError, Outbox, Unsent, outbox};
+use terrafarm_wire::link::{Connection, Heard, LinkError, Outbox, Unsent, WHILE_IT_COMES, outbox};
 use terrafarm_wire::message::{
     Blob, Done, Grant, OpenShot, Pong, RenderReport, Sharing, Speed, Status, Timesheet, Welcome,
 };
@@ -90,6 +90,8 @@ pub(crate) struct Shift<'a, C: Caster> {
     session: Session,
     compress: bool,
     silence: Duration,
+    /// When it last said unasked that it lives.
+    spoke: Instant,
     /// The store of the job that is begun, and how to stop it.
     current: Option<(BlobHash, Arc<AtomicBool>)>,
     paused: Option<Box<Job<C>>>,
@@ -117,6 +119,7 @@ impl<'a, C: Caster> Shift<'a, C> {
             session: Session::new(),
             compress,
             silence: Duration::from_micros(welcome.silence_us),
+            spoke: Instant::now(),
             current: None,
             paused: None,
             clock: TaskClock::new(Instant::now()),
@@ -154,9 +157,11 @@ impl<'a, C: Caster> Shift<'a, C> {
         while !(self.ended && self.backlog.is_empty()) {
             let waiting = self.backlog.front().cloned();
             let event = tokio::select! {
-                received = reader.recv_within(self.silence) => match received {
-                    Ok(Some(message)) => self.received(message, &outbox),
-                    Ok(None) => Err(LinkError::Closed),
+                heard = reader.hear(Some(self.silence)) => match heard {
+                    Ok(Heard::Message(message)) => self.received(message, &outbox),
+                    Ok(Heard::More) => self.speak_up(&outbox).map(|()| None),
+                    Ok(Heard::Claim(_)) => Ok(None),
+                    Ok(Heard::End) => Err(LinkError::Closed),
                     Err(lost) => Err(lost),
                 },
                 Some(report) = self.reported.recv() => Ok(Some(self.judge(report))),
@@ -203,6 +208,10 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Ok(None)
             }
             Message::Goodbye(_) => Err(LinkError::Closed),
+            Message::Blob(_) => {
+                self.speak_up(outbox)?;
+                Ok(Some(Event::Received(message)))
+            }
             Message::OpenShot(open) => {
                 // What this worker did before is no part of the shot.
                 if self.session.doing() == Doing::Idle {
@@ -212,6 +221,20 @@ impl<'a, C: Caster> Shift<'a, C> {
                 Ok(Some(Event::Received(open.into())))
             }
             message => Ok(Some(Event::Received(message))),
+        }
+    }
+
+    /// Says that this worker lives, unasked but not too often: where the link is slow, the
+    /// question waits behind the terrain that comes, and the answer would be late.
+    fn speak_up(&mut self, outbox: &Outbox) -> Result<(), LinkError> {
+        if self.spoke.elapsed() < WHILE_IT_COMES {
+            return Ok(());
+        }
+        self.spoke = Instant::now();
+        match outbox.try_send(Pong { number: 0 }) {
+            Err(Unsent::Closed) => Err(LinkError::Closed),
+            // A full lane means that the coordinator will hear from us in any case.
+            Ok(()) | Err(Unsent::Full) => Ok(()),
         }
     }
 

@@ -161,6 +161,8 @@ pub struct Decoder {
 struct Train {
     part: Part,
     bytes: BytesMut,
+    /// Whether its length was told.
+    is_told: bool,
 }
 
 impl Decoder {
@@ -172,6 +174,13 @@ impl Decoder {
     /// The greeting is over: lets in everything of the agreed version.
     pub fn open(&mut self, version: u16) {
         self.phase = Phase::Open { version };
+    }
+
+    /// How long the payload will be whose first part has come, bytes; told once.
+    pub fn take_claim(&mut self) -> Option<usize> {
+        let train = self.train.as_mut().filter(|train| !train.is_told)?;
+        train.is_told = true;
+        Some(train.part.total as usize)
     }
 
     /// Whether parts of a message have come, but not yet the message.
@@ -234,7 +243,11 @@ impl Decoder {
         if length > limit {
             return Err(WireError::TooLong { kind: part.kind, length, limit });
         }
-        let train = self.train.get_or_insert_with(|| Train { part, bytes: BytesMut::new() });
+        let train = self.train.get_or_insert_with(|| Train {
+            part,
+            bytes: BytesMut::new(),
+            is_told: false,
+        });
         let fits = train.bytes.len() + payload.len() < part.total as usize;
         if train.part != part || payload.is_empty() || !fits {
             return Err(out_of_place);
@@ -333,6 +346,19 @@ mod tests {
             assert!(frames.iter().all(|frame| frame.to_vec().len() <= FRAME_BYTES_MAX));
             assert_eq!(decode(&bytes(&frames)), Ok(vec![message]));
         }
+    }
+
+    #[test]
+    fn the_length_of_a_long_payload_is_told_once_when_its_first_part_has_come() {
+        let mut decoder = Decoder::new(Phase::Open { version: NEWEST_VERSION });
+        let mut buffer = BytesMut::from(&bytes(&frames(&blob(PART_BYTES)))[..]);
+        assert!(matches!(decoder.decode(&mut buffer), Ok(Some(_))));
+        assert_eq!(decoder.take_claim(), None, "it came in one");
+        for frame in &frames(&blob(3 * PART_BYTES))[..2] {
+            buffer.extend_from_slice(&frame.to_vec());
+        }
+        assert_eq!(decoder.decode(&mut buffer), Ok(None));
+        assert_eq!((decoder.take_claim(), decoder.take_claim()), (Some(3 * PART_BYTES), None));
     }
 
     #[test]

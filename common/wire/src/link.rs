@@ -35,6 +35,10 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
 use tokio::time::{Instant, timeout_at};
 
+/// A peer that watches another, or is watched, makes something of a long message so often
+/// while it comes: on a slow link a heartbeat would wait behind it.
+pub const WHILE_IT_COMES: Duration = Duration::from_millis(50);
+
 /// Why a connection has ended other than cleanly.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
@@ -76,6 +80,7 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
                 buffer: BytesMut::new(),
                 decoder,
                 heard: Instant::now(),
+                told: None,
                 secure: None,
             },
             writer: Writer { stream: write, version: NEWEST_VERSION, secure: None },
@@ -111,6 +116,20 @@ impl<S: AsyncRead + AsyncWrite> Connection<S> {
     }
 }
 
+/// What comes from a peer.
+#[derive(Debug, Clone, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "nearly all of it are messages")]
+pub enum Heard {
+    /// A message.
+    Message(Message),
+    /// The first part of a payload of so many bytes: the rest is on its way.
+    Claim(usize),
+    /// More of a message that is not whole yet: the peer lives.
+    More,
+    /// The end: the peer has closed between two messages.
+    End,
+}
+
 /// The half that receives.
 #[derive(Debug)]
 pub struct Reader<R> {
@@ -119,6 +138,8 @@ pub struct Reader<R> {
     decoder: Decoder,
     /// When the last byte came.
     heard: Instant,
+    /// When a message that is not whole began to come, or was last told of.
+    told: Option<Instant>,
     /// Of a secure link: what opens its records, and what has arrived of them.
     secure: Option<(Opener, BytesMut)>,
 }
@@ -128,20 +149,43 @@ impl<R: AsyncRead + Unpin> Reader<R> {
     ///
     /// Cancel safe: what has arrived is kept for the next call.
     pub async fn recv(&mut self) -> Result<Option<Message>, LinkError> {
-        self.next(None).await
+        self.next_message(None).await
     }
 
     /// As [`Reader::recv`], but fails with [`LinkError::Silent`] when not one byte has come
     /// for so long, cancelled calls included. A long message that trickles in is not
     /// silence.
     pub async fn recv_within(&mut self, silence: Duration) -> Result<Option<Message>, LinkError> {
-        self.next(Some(silence)).await
+        self.next_message(Some(silence)).await
     }
 
-    async fn next(&mut self, silence: Option<Duration>) -> Result<Option<Message>, LinkError> {
+    async fn next_message(
+        &mut self,
+        silence: Option<Duration>,
+    ) -> Result<Option<Message>, LinkError> {
+        loop {
+            match self.hear(silence).await? {
+                Heard::Message(message) => return Ok(Some(message)),
+                Heard::Claim(_) | Heard::More => {}
+                Heard::End => return Ok(None),
+            }
+        }
+    }
+
+    /// As [`Reader::recv_within`] where there is a limit, else as [`Reader::recv`]; but says
+    /// when a long payload begins, before more than a few parts of it are taken: a receiver
+    /// with little memory calls again when it has some, and until then the sender is held
+    /// back. And while a message comes for longer than [`WHILE_IT_COMES`], it says so after
+    /// each such time in which bytes of it came.
+    pub async fn hear(&mut self, silence: Option<Duration>) -> Result<Heard, LinkError> {
+        let mut has_read = false;
         loop {
             if let Some(message) = self.decoder.decode(&mut self.buffer)? {
-                return Ok(Some(message));
+                self.told = None;
+                return Ok(Heard::Message(message));
+            }
+            if let Some(bytes) = self.decoder.take_claim() {
+                return Ok(Heard::Claim(bytes));
             }
             let arrived = match &mut self.secure {
                 None => &mut self.buffer,
@@ -153,6 +197,13 @@ impl<R: AsyncRead + Unpin> Reader<R> {
                     arrived
                 }
             };
+            if std::mem::take(&mut has_read) {
+                let told = *self.told.get_or_insert(self.heard);
+                if self.heard - told >= WHILE_IT_COMES {
+                    self.told = Some(self.heard);
+                    return Ok(Heard::More);
+                }
+            }
             let read = self.stream.read_buf(arrived);
             let count = match silence {
                 None => read.await?,
@@ -164,9 +215,10 @@ impl<R: AsyncRead + Unpin> Reader<R> {
             if count == 0 {
                 let whole = self.secure.as_ref().is_none_or(|(_, arrived)| arrived.is_empty());
                 let clean = whole && self.buffer.is_empty() && !self.decoder.is_inside_message();
-                return if clean { Ok(None) } else { Err(LinkError::Cut) };
+                return if clean { Ok(Heard::End) } else { Err(LinkError::Cut) };
             }
             self.heard = Instant::now();
+            has_read = true;
         }
     }
 }

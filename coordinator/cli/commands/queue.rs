@@ -13,11 +13,14 @@ use super::runtime;
 use crate::args::queue as args;
 use crate::{Outcome, secret};
 use anyhow::{Context, bail};
+use bytes::Bytes;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::json;
 use std::io::Write;
-use terrafarm_coordinator::ask::{Answer, Line};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use terrafarm_coordinator::ask::{Answer, Line, Turn};
 use terrafarm_coordinator::view::{ShotView, WorkerView};
 use terrafarm_wire::link::Trust;
 use terrafarm_wire::message::Verb;
@@ -25,10 +28,15 @@ use terrafarm_wire::message::Verb;
 /// Entries of a list that are asked for at once.
 const PAGE: usize = 1000;
 
+/// How long a coordinator that is there and has no time is asked again, and one that was
+/// there and has gone.
+const TURN_LIMIT: Duration = Duration::from_secs(600);
+
 /// A line to a coordinator, and how to open another one.
 struct Desk {
     address: String,
     trust: Trust,
+    turn: Arc<Turn>,
     line: Line,
 }
 
@@ -36,18 +44,26 @@ impl Desk {
     async fn open(office: &args::Office) -> anyhow::Result<Self> {
         let trust = secret::to_connect(&office.security)?;
         let address = office.coordinator.clone();
-        let line = Line::open(&address, &trust).await?;
-        Ok(Desk { address, trust, line })
+        let turn = Arc::new(Turn::new(TURN_LIMIT, |why| eprintln!("terrafarm: {why}")));
+        let line = Line::open_in_turn(&address, &trust, &turn).await?;
+        Ok(Desk { address, trust, turn, line })
     }
 
-    /// A second line to the same coordinator.
-    async fn another(&self) -> anyhow::Result<Line> {
-        Ok(Line::open(&self.address, &self.trust).await?)
+    /// One more line to the same coordinator, if it has a place for one now.
+    async fn another(&self) -> anyhow::Result<Option<Line>> {
+        match Line::open(&self.address, &self.trust).await {
+            Err(why) if why.is_full() => Ok(None),
+            opened => Ok(Some(opened?)),
+        }
+    }
+
+    /// Asks for what does no more when it is asked twice.
+    async fn ask(&mut self, verb: Verb, path: &str, body: Bytes) -> anyhow::Result<Answer> {
+        Ok(self.line.ask_again(verb, path, None, body, &self.turn).await?)
     }
 
     async fn get<T: DeserializeOwned>(&mut self, path: &str) -> anyhow::Result<T> {
-        let answer = self.line.ask(Verb::Get, path, None, Default::default()).await?;
-        read(&answer)
+        read(&self.ask(Verb::Get, path, Default::default()).await?)
     }
 
     /// Gives an order and prints what came of it.
@@ -145,7 +161,15 @@ pub fn shots(args: &args::Shots) -> anyhow::Result<Outcome> {
         }
         let head = ["shot", "state", "priority", "frames", "frames/s", "left", "name"];
         let rows: Vec<_> = shots.iter().map(shot_row).collect();
-        say(table(&head, &rows).trim_end())
+        say(table(&head, &rows).trim_end())?;
+        if args.shot.is_some() {
+            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+            for past in shots.iter().flat_map(|shot| &shot.history) {
+                let ago = duration(now.saturating_sub(past.at_s) as f64);
+                say(&printable(&format!("{ago} ago: {}", past.what)))?;
+            }
+        }
+        Ok(Outcome::Done)
     })
 }
 

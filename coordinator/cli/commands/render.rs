@@ -24,6 +24,7 @@ fn plan(args: &args::Render) -> anyhow::Result<Plan> {
     Ok(Plan {
         name: args.output.display().to_string(),
         output: args.output.clone(),
+        live: args.live,
         encoder: match args.encoder {
             args::Encoder::Builtin => Encoder::BuiltIn,
             args::Encoder::Ffmpeg => Encoder::Ffmpeg,

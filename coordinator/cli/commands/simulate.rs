@@ -125,7 +125,7 @@ fn print_invariants(broken: &Violations) {
     if broken.is_clean() {
         println!(
             "every frame complete once, no pixel lost or doubled, no lease held twice unless on \
-             purpose, nothing of a zombie merged: all invariants hold"
+             purpose, nothing of a zombie merged, nobody silent unnoticed: all invariants hold"
         );
     } else {
         println!("broken invariants: {broken:?}");

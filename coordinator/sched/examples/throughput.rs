@@ -49,6 +49,7 @@ fn main() {
             priority: 0,
             // Twice 240 strips for every 240 workers, and some.
             frames_in_flight: 32.max((workers / 100) as u32),
+            live: false,
         },
     );
     let mut answers = VecDeque::new();

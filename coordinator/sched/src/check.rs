@@ -1,6 +1,8 @@
 //! What always holds, said as a check that tests and the simulator run.
 
-use crate::scheduler::Scheduler;
+use crate::event::Micros;
+use crate::scheduler::{Scheduler, Timer};
+use crate::shot::Shot;
 use std::collections::BTreeMap;
 use terrafarm_common::id::ShotId;
 
@@ -23,6 +25,7 @@ impl Scheduler {
         })?;
         self.check_leases()?;
         self.check_workers()?;
+        self.check_watch()?;
         self.audits.check()?;
         self.shots.keys().try_for_each(|&shot| self.check_shot(shot))
     }
@@ -79,6 +82,22 @@ impl Scheduler {
         }
         let hungry = self.workers.values().filter(|worker| worker.hunger.is_some()).count();
         ensure(hungry == self.hungry.len(), || "someone gone is hungry".into())
+    }
+
+    /// Somebody looks after every worker, as sharply as the shots want it.
+    fn check_watch(&self) -> Result<(), String> {
+        let is_live = self.shots.values().any(Shot::is_waited_for);
+        ensure(self.live_since.is_some() == is_live, || {
+            format!("the live rule holds since {:?}, wrongly", self.live_since)
+        })?;
+        for (&id, worker) in &self.workers {
+            let is_watched =
+                worker.beat_at.is_some_and(|at| self.timers.contains(&(at, Timer::Beat(id))));
+            ensure(is_watched || self.now == Micros(u64::MAX), || {
+                format!("nobody will look whether {id} is still there")
+            })?;
+        }
+        Ok(())
     }
 
     /// Every atom of an open frame is in exactly one place.

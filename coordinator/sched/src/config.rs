@@ -39,6 +39,11 @@ pub struct Config {
     pub heartbeat_us: u64,
     /// A worker that has been silent this long is dropped, microseconds.
     pub silence_us: u64,
+    /// The same two times while a live shot is under way, microseconds: see `watch.rs`.
+    /// A probe and its answer have to fit between them.
+    pub live_heartbeat_us: u64,
+    /// See `live_heartbeat_us`.
+    pub live_silence_us: u64,
     /// How many of the accepted jobs are rendered again by another worker and compared:
     /// this much of the farm's work. See `audit.rs`.
     pub audit: Share,
@@ -56,6 +61,8 @@ impl Default for Config {
             lease_floor_us: 10_000_000,
             heartbeat_us: 1_000_000,
             silence_us: 5_000_000,
+            live_heartbeat_us: 125_000,
+            live_silence_us: 450_000,
             audit: Share::NONE,
         }
     }

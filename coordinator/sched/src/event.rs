@@ -82,6 +82,10 @@ pub enum Event {
         /// Frames open or finished but not yet taken, 1 to
         /// [`crate::MAX_FRAMES_IN_FLIGHT`]: the bound on the coordinator's memory.
         frames_in_flight: u32,
+        /// Whether somebody waits for each of its frames: until it is over, and while it is
+        /// not paused, workers that fall silent are dropped after
+        /// [`crate::Config::live_silence_us`].
+        live: bool,
     },
     /// When pixels of the right number have arrived. Answered by [`Action::Accept`],
     /// [`Action::Compared`] or [`Action::Refuse`] before any other action.
@@ -400,7 +404,8 @@ pub enum RefuseReason {
 /// Why a worker is dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, thiserror::Error)]
 pub enum DropReason {
-    /// When no byte came for [`crate::Config::silence_us`].
+    /// When no byte came for [`crate::Config::silence_us`], or for
+    /// [`crate::Config::live_silence_us`] while somebody waited for frames.
     #[error("silent for {silence_us} us, probes unanswered; is the machine asleep or unplugged?")]
     Silent {
         /// How long, microseconds.

@@ -8,7 +8,7 @@
 //! that workers gave for their failures.
 //!
 //! ```text
-//! journal  "TFNIGHT", version 1, then records: Start, then Events and Marks
+//! journal  "TFNIGHT", version 2, then records: Start, then Events and Marks
 //! record   length of the body (LEB128, 1 to 3 bytes)
 //!          check of the length (2 bytes), body (postcard), check of the body (4 bytes)
 //! ```
@@ -30,7 +30,7 @@ pub use replay::{Difference, ReplayError, ReplayReport, Torn, replay};
 /// What every journal begins with; the last byte is the version of the format. Raise it
 /// when [`crate::Event`] or [`crate::Config`] are changed other than by new variants at the
 /// end of an enum.
-const MAGIC: [u8; 8] = *b"TFNIGHT\x01";
+const MAGIC: [u8; 8] = *b"TFNIGHT\x02";
 /// The largest record, bytes of its body. The longest event, jobs handed back as the wire
 /// allows it, takes a sixth of that.
 const RECORD_BYTES_MAX: usize = 64 << 10;

@@ -14,7 +14,7 @@
 //! scheduler.handle(now, Event::WorkerJoined { worker: WorkerId(1), threads: 8 });
 //! scheduler.handle(now, Event::ShotSubmitted {
 //!     shot: ShotId(1), frames: 1, width: 640, height: 360,
-//!     split: Split::Columns, priority: 0, frames_in_flight: 2,
+//!     split: Split::Columns, priority: 0, frames_in_flight: 2, live: false,
 //! });
 //! while let Some(action) = scheduler.poll_action() {
 //!     if let Action::Grant { worker, lease, region, .. } = action {
@@ -48,6 +48,7 @@ mod share;
 mod shot;
 pub mod sim;
 mod split;
+mod watch;
 mod why;
 mod worker;
 

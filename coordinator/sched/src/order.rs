@@ -31,6 +31,7 @@ impl Scheduler {
             self.end_lease(lease, End::Barred);
         }
         self.refresh_ready(shot);
+        self.refresh_live();
         self.close_audits_of(shot);
     }
 
@@ -40,6 +41,7 @@ impl Scheduler {
         if known.is_paused {
             known.is_paused = false;
             self.catch_up(shot, 0.0);
+            self.refresh_live();
         }
         self.refresh_ready(shot);
     }

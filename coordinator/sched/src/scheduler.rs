@@ -1,7 +1,8 @@
 //! The state machine: its parts, and what workers and shots that come and go do to it.
 //!
-//! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `order.rs` obeys people,
-//! `share.rs` keeps equals equal, and `check.rs` states what always holds.
+//! Jobs are given out in `grant.rs` and come back in `outcome.rs`; `watch.rs` notices who has
+//! gone, `order.rs` obeys people, `share.rs` keeps equals equal, and `check.rs` states what
+//! always holds.
 
 use crate::audit::Audits;
 use crate::config::{Config, MAX_SHOTS, MAX_WORKERS};
@@ -74,6 +75,8 @@ pub struct Scheduler {
     pub(crate) ready: BTreeSet<ReadyKey>,
     /// Leases that are the only one of their job, by when they count as late.
     pub(crate) hedgeable: BTreeSet<(Micros, LeaseId)>,
+    /// Since when silence counts by the live rule, if it does.
+    pub(crate) live_since: Option<Micros>,
     /// Sums over the workers that are not draining: how many, threads, speed.
     pub(crate) active: usize,
     pub(crate) active_threads: u64,
@@ -99,6 +102,7 @@ impl Scheduler {
             parked: BTreeSet::new(),
             ready: BTreeSet::new(),
             hedgeable: BTreeSet::new(),
+            live_since: None,
             active: 0,
             active_threads: 0,
             active_speed: 0.0,
@@ -108,7 +112,7 @@ impl Scheduler {
     /// Takes in what happened. `now` should not go back between calls; an earlier time is
     /// taken for the latest one seen. Drain [`Self::poll_action`] afterwards.
     pub fn handle(&mut self, now: Micros, event: Event) {
-        self.now = self.now.max(now);
+        self.wake(now);
         let may_urge = matches!(
             event,
             Event::ShotSubmitted { .. } | Event::ShotResumed { .. } | Event::ShotPrioritised { .. }
@@ -140,10 +144,11 @@ impl Scheduler {
                 split,
                 priority,
                 frames_in_flight,
+                live,
             } => {
                 let size = (width, height);
                 let made = Shot::new(&self.config, frames, size, split, priority, frames_in_flight);
-                self.submit(shot, made);
+                self.submit(shot, made.map(|made| made.lively(live)));
             }
             Event::JobDone { worker, lease, cost_us, digest } => {
                 self.hear(worker);
@@ -224,9 +229,7 @@ impl Scheduler {
         let joined = Worker::new(threads, self.now);
         self.workers.insert(worker, joined);
         self.enter_active(worker);
-        let spread = self.rng.below(self.config.heartbeat_us / 4);
-        let beat_at = self.now.after(self.config.heartbeat_us - spread);
-        self.timers.insert((beat_at, Timer::Beat(worker)));
+        self.watch(worker);
         self.refresh_hunger(worker);
     }
 
@@ -252,12 +255,6 @@ impl Scheduler {
                 self.active_speed += change;
             }
             self.refresh_hunger(worker);
-        }
-    }
-
-    fn hear(&mut self, worker: WorkerId) {
-        if let Some(known) = self.workers.get_mut(&worker) {
-            known.heard_at = self.now;
         }
     }
 
@@ -299,7 +296,7 @@ impl Scheduler {
     }
 
     /// Removes a worker; what it held waits for a new lease.
-    fn forget_worker(&mut self, worker: WorkerId) {
+    pub(crate) fn forget_worker(&mut self, worker: WorkerId) {
         let Some(known) = self.workers.get(&worker) else { return };
         let held: Vec<LeaseId> = known.held.iter().copied().collect();
         if known.is_active() {
@@ -332,6 +329,7 @@ impl Scheduler {
                 self.shots.insert(shot, made);
                 self.catch_up(shot, 0.0);
                 self.refresh_ready(shot);
+                self.refresh_live();
             }
             Err(reason) => self.actions.push_back(Action::ShotFailed { shot, reason }),
         }
@@ -347,6 +345,7 @@ impl Scheduler {
             self.end_lease(lease, End::Unwanted);
         }
         self.shots.remove(&shot);
+        self.refresh_live();
         self.close_audits_of(shot);
     }
 
@@ -357,37 +356,10 @@ impl Scheduler {
             }
             self.timers.pop_first();
             match timer {
-                Timer::Beat(worker) => self.beat(worker),
+                Timer::Beat(worker) => self.beat(worker, at),
                 Timer::Head(worker) => self.head_expired(worker),
                 Timer::Yield(worker) => self.yield_head(worker),
             }
-        }
-    }
-
-    /// Looks whether a worker is still there. A worker that has gone is passed over, so
-    /// that nobody has to look for its timer when it goes.
-    fn beat(&mut self, worker: WorkerId) {
-        let Some(known) = self.workers.get(&worker) else { return };
-        let (heartbeat_us, allowed_us) = (self.config.heartbeat_us, self.config.silence_us);
-        let heard_at = known.heard_at;
-        let silence_us = self.now.since(heard_at);
-        if silence_us >= allowed_us {
-            self.forget_worker(worker);
-            let why = DropReason::Silent { silence_us };
-            self.actions.push_back(Action::Drop { worker, why });
-            return;
-        }
-        let next_at = if silence_us < heartbeat_us {
-            heard_at.after(heartbeat_us)
-        } else {
-            self.actions.push_back(Action::Probe { worker });
-            self.now.after(heartbeat_us).min(heard_at.after(allowed_us))
-        };
-        // One microsecond at least, so that a heartbeat of 0 cannot hold the clock; and at
-        // the end of time nothing is due any more.
-        let next_at = next_at.max(self.now.after(1));
-        if next_at > self.now {
-            self.timers.insert((next_at, Timer::Beat(worker)));
         }
     }
 

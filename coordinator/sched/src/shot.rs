@@ -102,6 +102,8 @@ pub(crate) struct Shot {
     pub(crate) priority: i32,
     /// Whether it waits until someone resumes it.
     pub(crate) is_paused: bool,
+    /// Whether somebody waits for each of its frames.
+    pub(crate) is_live: bool,
     /// Work charged to it, cost units; only differences between equals mean anything.
     pub(crate) served: f64,
     /// The most frames open or untaken.
@@ -169,6 +171,7 @@ impl Shot {
             frames,
             priority,
             is_paused: false,
+            is_live: false,
             served: 0.0,
             frames_in_flight,
             next_frame: 0,
@@ -189,6 +192,11 @@ impl Shot {
         })
     }
 
+    /// The same, and whether somebody waits for each of its frames.
+    pub(crate) fn lively(self, is_live: bool) -> Self {
+        Shot { is_live, ..self }
+    }
+
     /// The job that a lease is for; `None` for that of an audit.
     pub(crate) fn job_of(&self, lease: &Lease) -> Option<&Job> {
         let job = self.running.get(&(lease.frame, lease.start));
@@ -205,6 +213,11 @@ impl Shot {
     /// Whether there is anything to grant.
     pub(crate) fn has_work(&self) -> bool {
         (!self.waiting.is_empty() || self.has_uncut()) && !self.is_paused
+    }
+
+    /// Whether somebody waits for a frame of it now.
+    pub(crate) fn is_waited_for(&self) -> bool {
+        self.is_live && !self.is_paused
     }
 
     /// Whether there is anything that no job has been cut from.

@@ -86,6 +86,8 @@ pub(crate) struct Worker {
     pub(crate) is_suspect: bool,
     /// When the last byte came.
     pub(crate) heard_at: Micros,
+    /// When it is looked at next; `None` at the end of time.
+    pub(crate) beat_at: Option<Micros>,
     /// Where it stands among the hungry, if it does.
     pub(crate) hunger: Option<HungerKey>,
 }
@@ -107,6 +109,7 @@ impl Worker {
             is_distrusted: false,
             is_suspect: false,
             heard_at: now,
+            beat_at: None,
             hunger: None,
         }
     }

@@ -97,6 +97,7 @@ fn a_small_urgent_shot_takes_no_more_workers_than_it_has_jobs_for() {
         split: Default::default(),
         priority: 1,
         frames_in_flight: 1,
+        live: false,
     });
     // One running job and one that was queued behind it, of each.
     assert!(world.scheduler.account().preempted <= 4, "{:?}", world.scheduler.account());

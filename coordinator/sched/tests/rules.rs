@@ -80,6 +80,7 @@ impl Farm {
             split,
             priority,
             frames_in_flight,
+            live: false,
         })
     }
 
@@ -519,9 +520,11 @@ fn any_event() -> impl Strategy<Value = Event> {
         1 => worker().prop_map(|worker| Event::WorkerLost { worker, why: LostReason::Left }),
         1 => worker().prop_map(|worker| Event::WorkerDraining { worker }),
         1 => (worker(), prop::collection::vec(lease(), 0..5)).prop_map(|(worker, leases)| Event::HandedBack { worker, leases }),
-        2 => (shot(), 0u32..6, 0u32..90, 0u32..40, split, -1i32..2, 0u32..4).prop_map(
-            |(shot, frames, width, height, split, priority, frames_in_flight)| Event::ShotSubmitted {
-                shot, frames, width, height, split, priority, frames_in_flight,
+        2 => (shot(), 0u32..6, 0u32..90, 0u32..40, split, -1i32..2, 0u32..4, any::<bool>()).prop_map(
+            |(shot, frames, width, height, split, priority, frames_in_flight, live)| {
+                Event::ShotSubmitted {
+                    shot, frames, width, height, split, priority, frames_in_flight, live,
+                }
             }),
         12 => (worker(), lease(), cost, 0u64..2).prop_map(|(worker, lease, cost_us, digest)| {
             Event::JobDone { worker, lease, cost_us, digest }

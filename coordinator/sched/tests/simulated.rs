@@ -52,6 +52,7 @@ fn bad_night(seed: u64, deadly: bool) -> SimConfig {
         workers: 1 + spread(12) as u32,
         seed,
         shots: 1 + spread(3) as u32,
+        live: spread(4) as u32,
         arrive_within_s: spread(2) as f64 * 10.0,
         frame_skew: spread(3) as f64 * 4.0,
         frames: 1 + spread(17) as u32,
@@ -214,6 +215,23 @@ fn a_dead_worker_is_noticed_within_5_seconds() {
 }
 
 #[test]
+fn a_dead_or_frozen_worker_is_noticed_within_half_a_second_while_somebody_waits() {
+    let faults = Faults {
+        within_s: 50.0,
+        power_cuts: 0.5,
+        hangs: 1.0,
+        partitions: 1.0,
+        switch_cuts: 5,
+        come_back: true,
+        ..Faults::default()
+    };
+    let report = run(&SimConfig { faults, live: 1, ..SimConfig::for_workers(200, 6) });
+    let notice = report.notice_s;
+    // Measured: 352 of them, p50 0.402 s.
+    assert!(notice.count > 300 && notice.max <= 0.5, "{notice:?}");
+}
+
+#[test]
 fn zombies_behind_failed_switches_are_refused() {
     let faults = Faults { within_s: 50.0, switch_cuts: 8, ..Faults::default() };
     let report = run(&SimConfig { faults, ..SimConfig::for_workers(100, 5) });
@@ -235,8 +253,9 @@ fn workers_that_come_and_go_all_night_are_used_while_they_are_there() {
 fn a_farm_with_a_third_of_its_links_slow_goes_on() {
     let faults = Faults { slow_links: 0.3, ..Faults::default() };
     let report = run(&SimConfig { faults, ..SimConfig::for_workers(100, 8) });
-    // Measured: 0.789. The links from home carry half of what the workers behind them
-    // render, which leaves 0.92; their late results are rendered twice, too.
+    // Measured: 0.759. The links from home carry half of what the workers behind them
+    // render, which leaves 0.92; their late results are rendered twice, too, and nobody is
+    // dropped whose bytes still come.
     assert!(report.efficiency >= 0.75, "{report:?}");
 }
 

@@ -21,12 +21,14 @@ pub(super) struct Refusal {
     text: String,
     /// Blobs that have to be sent first.
     missing: Vec<String>,
+    /// When to try again.
+    retry_after_s: Option<u64>,
 }
 
 impl Refusal {
     /// With this status and these words.
     pub fn new(status: StatusCode, text: impl Into<String>) -> Self {
-        Refusal { status, text: text.into(), missing: Vec::new() }
+        Refusal { status, text: text.into(), missing: Vec::new(), retry_after_s: None }
     }
 
     /// What was sent makes no sense.
@@ -51,6 +53,18 @@ impl Refusal {
         Refusal::new(StatusCode::NOT_IMPLEMENTED, text)
     }
 
+    /// There is no memory for its body.
+    pub fn busy(waited: Duration) -> Self {
+        let text = format!(
+            "others send so much that there was no room for this for {} s; try again",
+            waited.as_secs()
+        );
+        Refusal {
+            retry_after_s: Some(RETRY_AFTER_S),
+            ..Refusal::new(StatusCode::SERVICE_UNAVAILABLE, text)
+        }
+    }
+
     /// It took too long.
     pub fn too_slow(limit: Duration) -> Self {
         let text = format!("not done within {} s; try again", limit.as_secs());
@@ -58,14 +72,21 @@ impl Refusal {
     }
 }
 
+/// When to try again after [`Refusal::busy`], seconds.
+const RETRY_AFTER_S: u64 = 5;
+
 impl IntoResponse for Refusal {
     fn into_response(self) -> Response {
-        let Refusal { status, text, missing } = self;
+        let Refusal { status, text, missing, retry_after_s } = self;
         let mut body = json!({ "error": text });
         if !missing.is_empty() {
             body["missing"] = missing.into();
         }
-        (status, Json(body)).into_response()
+        let mut response = (status, Json(body)).into_response();
+        if let Some(seconds) = retry_after_s {
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
+        }
+        response
     }
 }
 
@@ -86,11 +107,12 @@ impl From<QueueError> for Refusal {
             QueueError::Order(order) => return order.into(),
             QueueError::Missing(hashes) => {
                 let missing = hashes.into_iter().map(|hash| hash.to_hex()).collect();
-                return Refusal { status: StatusCode::CONFLICT, text, missing };
+                return Refusal { missing, ..Refusal::new(StatusCode::CONFLICT, text) };
             }
             QueueError::NoShot(_) | QueueError::NoFrame { .. } => StatusCode::NOT_FOUND,
             QueueError::Unfit(_) | QueueError::WrongBlob { .. } => StatusCode::BAD_REQUEST,
             QueueError::TooMany(_) => StatusCode::PAYLOAD_TOO_LARGE,
+            QueueError::KeyReused { .. } => StatusCode::UNPROCESSABLE_ENTITY,
             QueueError::Over { .. } => StatusCode::CONFLICT,
             QueueError::Full | QueueError::DiskFull { .. } => StatusCode::INSUFFICIENT_STORAGE,
             QueueError::Stopping => StatusCode::SERVICE_UNAVAILABLE,

@@ -1,20 +1,26 @@
 //! Routes about shots: lists, submissions, orders.
 
+use super::Desk;
 use super::board::{Board, Page, Window};
+use super::carry::Paid;
 use super::refusal::Refusal;
-use super::{BULKY_AT_ONCE, Desk};
 use crate::order::Order;
-use crate::queue::{ShotPlan, parse_hash};
+use crate::queue::{ShotPlan, SubmissionKey, parse_hash};
 use crate::view::ShotView;
 use axum::Json;
-use axum::body::Bytes;
+use axum::body::{Bytes, HttpBody};
 use axum::extract::{Path, Query, Request, State};
+use axum::http::HeaderMap;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::sync::Arc;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId, WorkerId};
+use terrafarm_wire::limits::DESK_BODY_MAX;
+
+/// Says that a submission is the same one when it is sent again.
+const KEY_HEADER: &str = "idempotency-key";
 
 /// Answers of handlers.
 pub(super) type Answer = Result<Json<Value>, Refusal>;
@@ -57,14 +63,50 @@ pub(super) async fn one(State(desk): State<Arc<Desk>>, Path(shot): Path<String>)
     Ok(Json(json!(shot.as_ref())))
 }
 
+/// A key in the address, where there are no headers.
+#[derive(Deserialize)]
+pub(super) struct Keyed {
+    idempotency_key: Option<String>,
+}
+
+impl Keyed {
+    /// The key of a submission, by header or by address.
+    fn key(self, headers: &HeaderMap) -> Result<Option<String>, Refusal> {
+        let Some(header) = headers.get(KEY_HEADER) else { return Ok(self.idempotency_key) };
+        let text = header.to_str().map_err(|_| Refusal::malformed("the Idempotency-Key is odd"))?;
+        // Some write it as a string of structured headers.
+        let bare = text.strip_prefix('"').and_then(|text| text.strip_suffix('"'));
+        let key = bare.unwrap_or(text).to_owned();
+        match self.idempotency_key {
+            Some(other) if other != key => {
+                Err(Refusal::malformed("the header and the address have different keys"))
+            }
+            _ => Ok(Some(key)),
+        }
+    }
+}
+
 /// `POST /api/v1/shots`
-pub(super) async fn submit(State(desk): State<Arc<Desk>>, body: Bytes) -> Answer {
+pub(super) async fn submit(
+    State(desk): State<Arc<Desk>>,
+    Query(keyed): Query<Keyed>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Answer {
     let queue = desk.queue()?;
+    let key = keyed.key(&headers)?;
     // A million cameras take a second to read: not on a thread that others wait for.
-    let read = tokio::task::spawn_blocking(move || serde_json::from_slice::<ShotPlan>(&body));
-    let plan = read.await.map_err(|_| Refusal::malformed("the shot cannot be read"))?;
-    let plan = plan.map_err(|why| Refusal::malformed(format!("this is no shot: {why}")))?;
-    let shot = queue.submit(plan).await?;
+    let read = tokio::task::spawn_blocking(move || {
+        let key = key.map(|key| SubmissionKey::new(&key, &body)).transpose()?;
+        let plan = serde_json::from_slice::<ShotPlan>(&body);
+        let plan = plan.map_err(|why| Refusal::malformed(format!("this is no shot: {why}")))?;
+        Ok::<_, Refusal>((plan, key))
+    });
+    let read = read.await.map_err(|_| Refusal::malformed("the shot cannot be read"))?;
+    let shot = match read? {
+        (plan, Some(key)) => queue.submit_once(plan, key).await?,
+        (plan, None) => queue.submit(plan).await?,
+    };
     Ok(Json(json!({ "shot": shot })))
 }
 
@@ -94,17 +136,22 @@ fn hash(text: &str) -> Result<BlobHash, Refusal> {
     parse_hash(text).ok_or_else(|| Refusal::malformed("a hash has 64 hexadecimal digits"))
 }
 
-/// Lets so many long bodies come at once as [`BULKY_AT_ONCE`]; the others wait.
-pub(super) async fn one_of_few(
+/// Has a body wait until there is memory for it. What came over the link has its share already.
+pub(super) async fn within_budget(
     State(desk): State<Arc<Desk>>,
     request: Request,
     next: Next,
 ) -> Response {
-    let Ok(_one) = desk.bulky.acquire().await else {
-        let text = format!("{BULKY_AT_ONCE} bodies are taken at once");
-        return Refusal::malformed(text).into_response();
-    };
-    next.run(request).await
+    if request.extensions().get::<Paid>().is_some() {
+        return next.run(request).await;
+    }
+    // A body of which nobody says how long it is may be as long as any.
+    let length = request.body().size_hint().upper().unwrap_or(u64::MAX);
+    let length = usize::try_from(length).unwrap_or(usize::MAX).min(DESK_BODY_MAX);
+    match desk.budget.claim(length).await {
+        Some(_claim) => next.run(request).await,
+        None => Refusal::busy(desk.budget.patience()).into_response(),
+    }
 }
 
 /// What came of an order, as JSON.

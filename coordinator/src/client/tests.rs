@@ -29,6 +29,7 @@ async fn stuck(silence: Duration, stop: impl FnOnce(CancellationToken)) -> Clien
         cameras: plan.cameras,
         frames_in_flight: 1,
         priority: 0,
+        live: false,
     };
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let coordinator = Coordinator::local(listener.local_addr().unwrap());

@@ -198,6 +198,7 @@ impl Farm {
             eta_s: will_end.then(|| f64::from(left) / frames_per_s),
             last_frame: tally.last_frame.map(|frame| shot.number(frame)),
             film: false,
+            history: Vec::new(),
         }
     }
 }

@@ -46,8 +46,11 @@ impl Farm {
             PeerEvent::Said(message) if self.workers.contains_key(&worker) => {
                 self.hear_worker(now, worker, message);
             }
+            PeerEvent::Stirred if self.workers.contains_key(&worker) => {
+                self.schedule(now, Event::HeardFrom { worker });
+            }
             // It has been dropped; what was still on its way does not count.
-            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
+            PeerEvent::Said(_) | PeerEvent::Stirred | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -111,7 +114,7 @@ impl Farm {
             PeerEvent::Adopt(adoption) if self.clients.contains_key(&client) => {
                 self.adopt(now, client, *adoption);
             }
-            PeerEvent::Said(_) | PeerEvent::Adopt(_) => {}
+            PeerEvent::Said(_) | PeerEvent::Stirred | PeerEvent::Adopt(_) => {}
         }
     }
 
@@ -131,7 +134,8 @@ impl Farm {
             Message::Cameras(cameras) => match self.shots.add_cameras(client, &cameras) {
                 Ok(Some((accepted, event))) => {
                     let frames = self.shots.get(accepted.shot).map_or(0, |shot| shot.submit.frames);
-                    tracing::info!(shot = %accepted.shot, frames, "shot submitted");
+                    let live = self.shots.get(accepted.shot).is_some_and(|shot| shot.submit.live);
+                    tracing::info!(shot = %accepted.shot, frames, live, "shot submitted");
                     self.send(Peer::Client(client), accepted);
                     self.schedule(now, event);
                 }

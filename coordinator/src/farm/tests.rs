@@ -94,6 +94,7 @@ fn submission(frames: u32) -> Submit {
         frames,
         frames_in_flight: 2,
         priority: 0,
+        live: false,
     }
 }
 
@@ -185,6 +186,28 @@ fn what_a_lost_worker_held_is_rendered_by_another_and_its_late_result_is_refused
     let out = bench.join(worker(2), 1);
     assert!(grants(&out).iter().all(|(_, grant)| grant.lease > held.lease));
     assert_eq!(render_all(&mut bench, out).len(), 1);
+}
+
+#[test]
+fn a_worker_whose_long_message_comes_slowly_is_not_dropped_from_a_live_shot() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    bench.join(worker(2), 1);
+    bench.join(Peer::Client(CLIENT), 0);
+    bench.say(Peer::Client(CLIENT), Submit { live: true, ..submission(1) });
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
+    bench.say(Peer::Client(CLIENT), Cameras { number: 1, first: 0, cameras: vec![camera] });
+    let mut closed = Vec::new();
+    for _ in 0..25 {
+        bench.now = bench.now.after(39_000);
+        for one in bench.event(worker(1), PeerEvent::Stirred) {
+            if let Out::Close(peer, why) = one {
+                closed.push((peer, why));
+            }
+        }
+    }
+    assert_eq!(closed.len(), 1, "{closed:?}");
+    assert_eq!(closed[0].0, worker(2), "it said nothing");
 }
 
 #[test]
@@ -306,6 +329,7 @@ fn a_shot_that_needs_too_much_memory_is_rejected_with_advice() {
         frames: 1000,
         frames_in_flight: 1000,
         priority: 0,
+        live: false,
     };
     let out = bench.say(Peer::Client(CLIENT), submit);
     let [Out::Send(_, Message::Rejected(rejected))] = &out[..] else { panic!("{out:?}") };

@@ -1,6 +1,7 @@
 //! Whom the farm believes: what audits need of pixels, and what they find.
 
 use super::{Farm, Greeting};
+use crate::shots::Doubt;
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
@@ -89,10 +90,15 @@ impl Farm {
              cooling, then clear it"
         );
         for SentFrames { shot, frames } in sent {
-            let frames = spoken(&self.numbered(*shot, frames));
+            let numbers = spoken(&self.numbered(*shot, frames));
+            let doubt = Doubt { worker: name.clone(), frames: frames.clone() };
+            let again = match self.shots.get(*shot).is_some_and(|state| state.doubt(doubt)) {
+                true => "the queue has them rendered again",
+                false => "render them again",
+            };
             tracing::error!(
                 %worker, %name, %shot,
-                "audit: {frames} were sent with pixels of it; render them again"
+                "audit: {numbers} were sent with pixels of it; {again}"
             );
         }
         if let Some(state) = self.workers.get(&worker) {

@@ -1,8 +1,10 @@
 //! Terrain of the queue: one file a blob, named by its hash.
 //!
 //! A blob is checked when it comes and each time it is read: a damaged one is removed, so
-//! that it counts as missing and is sent again. Blobs are synced when a shot that needs
-//! them is taken, not one by one.
+//! that it counts as missing and is sent again. One that the disk does not read, and all
+//! blobs of a store of which one was damaged, are suspect: they count as here when they have
+//! been read from end to end, and what is sent takes their place. Blobs are synced when a shot
+//! that needs them is taken, not one by one.
 
 use super::{QueueConfig, QueueError, disk};
 use bytes::Bytes;
@@ -17,6 +19,9 @@ use terrafarm_common::id::BlobHash;
 use terrafarm_terrain::store::{decode_index, hash_of};
 use terrafarm_wire::limits::BLOB_BYTES_MAX;
 
+/// Most blobs that are suspect at once; of more, each shows when it is read.
+const SUSPECTS_MAX: usize = 1 << 20;
+
 /// The terrain of the queue.
 #[derive(Debug)]
 pub struct Blobs {
@@ -24,6 +29,8 @@ pub struct Blobs {
     folder: PathBuf,
     /// Those that came and are not yet known to be on the disk.
     unsynced: Mutex<HashSet<BlobHash>>,
+    /// Those that are believed when they have been read.
+    suspects: Mutex<HashSet<BlobHash>>,
     count: AtomicU64,
 }
 
@@ -34,6 +41,7 @@ impl Blobs {
             config: config.clone(),
             folder: config.folder.join("blobs"),
             unsynced: Mutex::default(),
+            suspects: Mutex::default(),
             count: AtomicU64::new(0),
         }
     }
@@ -64,7 +72,8 @@ impl Blobs {
         disk::has_room(&self.config.folder, self.config.reserve_bytes, 0)
     }
 
-    /// Those that are not here; the others stay for the time of grace from now on.
+    /// Those that are not here; the others stay for the time of grace from now on. Reads
+    /// those that are suspect.
     pub fn missing(&self, hashes: Vec<BlobHash>) -> Vec<BlobHash> {
         let now = SystemTime::now();
         hashes.into_iter().filter(|&hash| !self.touch(hash, now)).collect()
@@ -72,6 +81,9 @@ impl Blobs {
 
     /// Marks a blob as used now; returns whether it is here.
     fn touch(&self, hash: BlobHash, now: SystemTime) -> bool {
+        if self.suspects().contains(&hash) && !matches!(self.read(hash), Ok(Some(_))) {
+            return false;
+        }
         let file = File::options().append(true).open(self.path(hash));
         // One that cannot be marked is here all the same.
         file.map(|file| file.set_modified(now)).is_ok()
@@ -105,6 +117,7 @@ impl Blobs {
             let _ = fs::remove_file(&beside);
             return Err(self.error("write", &self.path(hash), &why));
         }
+        self.suspects().remove(&hash);
         self.unsynced().insert(hash);
         Ok(())
     }
@@ -112,8 +125,34 @@ impl Blobs {
     /// A blob; `None` if it is not here, or was damaged and is no longer.
     ///
     /// # Errors
-    /// If the disk cannot read it.
+    /// If the disk cannot read it: then it is suspect.
     pub fn read(&self, hash: BlobHash) -> Result<Option<Bytes>, QueueError> {
+        let read = self.read_through(hash);
+        match &read {
+            Ok(_) => drop(self.suspects().remove(&hash)),
+            Err(_) => self.suspect([hash]),
+        }
+        read
+    }
+
+    fn suspect(&self, hashes: impl IntoIterator<Item = BlobHash>) {
+        let mut suspects = self.suspects();
+        let room = SUSPECTS_MAX.saturating_sub(suspects.len());
+        suspects.extend(hashes.into_iter().take(room));
+    }
+
+    /// A blob of this store was damaged: so may be others of the same disk. Whoever sends the
+    /// terrain again is to be asked for all of them at once.
+    ///
+    /// # Errors
+    /// If its index cannot be read: that comes first then.
+    pub fn suspect_store(&self, index: BlobHash) -> Result<(), QueueError> {
+        let all = self.store(index)?;
+        self.suspect(all.into_iter().map(|(hash, _)| hash));
+        Ok(())
+    }
+
+    fn read_through(&self, hash: BlobHash) -> Result<Option<Bytes>, QueueError> {
         let path = self.path(hash);
         let wrong = |why: &io::Error| self.error("read", &path, why);
         let file = match File::open(&path) {
@@ -191,14 +230,24 @@ impl Blobs {
     }
 
     /// Removes what no unfinished shot needs and nobody asked for lately, the longest
-    /// unused first, until the rest is within its limit. Returns bytes removed.
+    /// unused first, until the rest is within its limit and none of it is too old. Returns
+    /// bytes removed.
+    ///
+    /// Of a shot whose index is damaged or gone nobody knows what it needs: its terrain counts
+    /// as unused, since whoever sends the index again is asked for the rest, too.
     ///
     /// # Errors
-    /// If the index of a store in use cannot be read: then nothing is removed.
+    /// If the disk does not read the index of a store in use: then nothing is removed.
     pub fn sweep(&self, in_use: &HashSet<BlobHash>) -> Result<u64, QueueError> {
         let mut needed = HashSet::new();
         for &index in in_use {
-            needed.extend(self.store(index)?.into_iter().map(|(hash, _)| hash.to_hex()));
+            match self.store(index) {
+                Ok(all) => needed.extend(all.into_iter().map(|(hash, _)| hash.to_hex())),
+                Err(why @ (QueueError::Missing(_) | QueueError::Unfit(_))) => {
+                    tracing::warn!(%index, "nobody knows what a shot needs of its terrain: {why}");
+                }
+                Err(why) => return Err(why),
+            }
         }
         let now = SystemTime::now();
         let mut idle = Vec::new();
@@ -216,14 +265,21 @@ impl Blobs {
         idle.sort();
         let mut removed = 0;
         for (used, bytes, path) in idle {
-            let young = now.duration_since(used).unwrap_or_default() < self.config.terrain_grace;
-            if idle_bytes - removed <= self.config.terrain_cache_bytes || young {
+            let age = now.duration_since(used).unwrap_or_default();
+            let is_young = age < self.config.terrain_grace;
+            let is_old = age >= self.config.terrain_kept;
+            let is_within = idle_bytes - removed <= self.config.terrain_cache_bytes;
+            if is_young || (is_within && !is_old) {
                 break;
             }
             fs::remove_file(&path).map_err(|why| self.error("remove", &path, &why))?;
             removed += bytes;
         }
         Ok(removed)
+    }
+
+    fn suspects(&self) -> std::sync::MutexGuard<'_, HashSet<BlobHash>> {
+        self.suspects.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn unsynced(&self) -> std::sync::MutexGuard<'_, HashSet<BlobHash>> {
@@ -234,4 +290,48 @@ impl Blobs {
 /// What is in a folder; nothing if it is not there.
 fn entries(folder: &Path) -> impl Iterator<Item = fs::DirEntry> {
     fs::read_dir(folder).into_iter().flatten().flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::house::Land;
+    use super::*;
+    use std::time::Duration;
+
+    const DAY: Duration = Duration::from_secs(24 * 3600);
+
+    /// Terrain that came so many days ago.
+    fn aged(blobs: &Blobs, land: &Land, days: u32) {
+        for (hash, bytes) in &land.blobs {
+            blobs.put(*hash, bytes).expect("room");
+            blobs.touch(*hash, SystemTime::now() - days * DAY);
+        }
+    }
+
+    /// How many of a store's blobs are there.
+    fn here(blobs: &Blobs, land: &Land) -> usize {
+        land.blobs.iter().filter(|(hash, _)| blobs.path(*hash).exists()).count()
+    }
+
+    #[test]
+    fn terrain_that_no_shot_needs_goes_when_it_is_old_however_little_it_is() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let blobs = Blobs::new(&Arc::new(QueueConfig::new(folder.path())));
+        let land = Land::new(folder.path());
+        let (all, index) = (land.blobs.len(), land.index);
+        // Tiles came, and their index never did.
+        aged(&blobs, &land, 13);
+        fs::remove_file(blobs.path(index)).expect("it was there");
+        blobs.sweep(&HashSet::new()).expect("readable");
+        assert_eq!(here(&blobs, &land), all - 1, "not yet");
+        aged(&blobs, &land, 15);
+        blobs.sweep(&HashSet::from([index])).expect("readable");
+        assert_eq!(here(&blobs, &land), all, "a shot needs it");
+        // The index of a shot is gone: that holds up nothing.
+        fs::remove_file(blobs.path(index)).expect("it was there");
+        let removed = blobs.sweep(&HashSet::from([index])).expect("readable");
+        assert_eq!(here(&blobs, &land), 0);
+        let bytes = land.blobs.iter().filter(|(hash, _)| *hash != index);
+        assert_eq!(removed, bytes.map(|(_, bytes)| bytes.len() as u64).sum::<u64>());
+    }
 }

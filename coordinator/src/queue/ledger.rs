@@ -11,18 +11,17 @@
 //! | `cameras` | shot, piece | up to 1024 cameras of 13 f64 each, little endian |
 //! | `frames` | shot, index | [`FrameRecord`], JSON |
 //! | `progress` | shot | frames done, frames failed, last one done + 1 |
+//! | `keys` | key of a submission | shot, seconds since 1970, SHA-256 of the submission |
 
-use super::QueueError;
-use super::plan::ShotPlan;
-use crate::sink::manifest::{FrameEntry, WorkerEntry};
+use super::{QueueError, SubmissionKey};
 use redb::{Database, ReadableDatabase, ReadableTable, TableDefinition, WriteTransaction};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use terrafarm_common::camera::Camera;
-use terrafarm_common::id::{FrameIndex, ShotId};
+use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
 
 /// The format that this program reads and writes.
 const VERSION: u64 = 1;
@@ -33,105 +32,17 @@ const CAMERA_NUMBERS: usize = 13;
 /// Memory that redb may take for pages, bytes.
 const CACHE_BYTES: usize = 32 << 20;
 
+pub use super::record::{FrameRecord, Progress, Saved, ShotRecord, Stage};
+
 const META: TableDefinition<&str, u64> = TableDefinition::new("meta");
 const SHOTS: TableDefinition<u64, &[u8]> = TableDefinition::new("shots");
 const CAMERAS: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("cameras");
 const FRAMES: TableDefinition<(u64, u32), &[u8]> = TableDefinition::new("frames");
 const PROGRESS: TableDefinition<u64, (u32, u32, u32)> = TableDefinition::new("progress");
 
-/// How far a shot has come, as it is kept. What it does at the moment follows from it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Stage {
-    /// Frames are missing.
-    Open,
-    /// Frames are missing, and someone wants it to wait.
-    Paused,
-    /// Manifest and film are missing.
-    Finishing,
-    /// All is there.
-    Done,
-    /// It was given up.
-    Failed,
-    /// Someone canceled it.
-    Canceled,
-}
-
-impl Stage {
-    /// Whether nothing is left to do.
-    pub fn is_over(self) -> bool {
-        matches!(self, Stage::Done | Stage::Failed | Stage::Canceled)
-    }
-}
-
-/// One shot, without its cameras.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ShotRecord {
-    /// What was submitted; the cameras are kept apart.
-    pub plan: ShotPlan,
-    /// Number of frames.
-    pub frames: u32,
-    /// When it was submitted, seconds since 1970.
-    pub submitted_s: u64,
-    /// How far it has come.
-    pub stage: Stage,
-    /// Why, where that needs saying.
-    pub note: String,
-    /// Who rendered, as far as the farm has said.
-    pub workers: Vec<WorkerEntry>,
-}
-
-/// What became of one frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum FrameRecord {
-    /// Its picture is on the disk.
-    Done {
-        /// Its entry in the manifest.
-        entry: FrameEntry,
-        /// Size of the picture's file, bytes.
-        bytes: u64,
-    },
-    /// It could not be rendered, for this reason.
-    Failed(String),
-}
-
-/// How many frames of a shot are over.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Progress {
-    /// Finished.
-    pub done: u32,
-    /// Given up.
-    pub failed: u32,
-    /// The one that was finished last.
-    pub last: Option<FrameIndex>,
-}
-
-impl Progress {
-    /// Frames that are over.
-    pub fn over(self) -> u32 {
-        self.done.saturating_add(self.failed)
-    }
-
-    fn from_row((done, failed, next): (u32, u32, u32)) -> Self {
-        Progress { done, failed, last: next.checked_sub(1) }
-    }
-
-    fn row(self) -> (u32, u32, u32) {
-        (self.done, self.failed, self.last.map_or(0, |last| last.saturating_add(1)))
-    }
-}
-
-/// A shot as it was read.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Saved {
-    /// Its number.
-    pub id: ShotId,
-    /// What is kept of it.
-    pub record: ShotRecord,
-    /// How far it is.
-    pub progress: Progress,
-}
+/// Shot, seconds since 1970, hash of what was submitted.
+type KeyRow = (u64, u64, [u8; 32]);
+const KEYS: TableDefinition<&str, KeyRow> = TableDefinition::new("keys");
 
 /// Opens the file; again and again, if need be.
 type Opener = Box<dyn Fn() -> Result<Database, redb::DatabaseError> + Send>;
@@ -163,6 +74,7 @@ impl Ledger {
             transaction.open_table(CAMERAS)?;
             transaction.open_table(FRAMES)?;
             transaction.open_table(PROGRESS)?;
+            transaction.open_table(KEYS)?;
             let mut meta = transaction.open_table(META)?;
             let version = meta.get("version")?.map(|version| version.value());
             if version.is_none() {
@@ -178,30 +90,27 @@ impl Ledger {
         Ok(ledger)
     }
 
-    /// All shots by number, and the last number given.
+    /// All shots by number, and the last number given. Those that are damaged have failed.
     ///
     /// # Errors
     /// If they cannot be read.
     pub fn load(&mut self) -> Result<(u64, Vec<Saved>), QueueError> {
-        let (last, rows) = self.read(|transaction| {
+        self.read(|transaction| {
             let last = transaction.open_table(META)?.get("last")?.map_or(0, |last| last.value());
             let progress = transaction.open_table(PROGRESS)?;
             let mut rows = Vec::new();
             for row in transaction.open_table(SHOTS)?.iter()? {
                 let (id, record) = row?;
                 let far = progress.get(id.value())?.map(|far| far.value()).unwrap_or_default();
-                rows.push((ShotId(id.value()), record.value().to_vec(), Progress::from_row(far)));
+                let record = ShotRecord::read(record.value());
+                let progress = Progress::from_row(far);
+                rows.push(Saved { id: ShotId(id.value()), record, progress });
             }
             Ok((last, rows))
-        })?;
-        let saved = rows.into_iter().map(|(id, record, progress)| {
-            let record = self.parse(&format!("{id}"), &record)?;
-            Ok(Saved { id, record, progress })
-        });
-        Ok((last, saved.collect::<Result<_, QueueError>>()?))
+        })
     }
 
-    /// Adds a shot and its cameras.
+    /// Adds a shot and its cameras, and the key under which it was submitted, if it had one.
     ///
     /// # Errors
     /// If it cannot be written; then nothing is.
@@ -210,16 +119,60 @@ impl Ledger {
         id: ShotId,
         record: &ShotRecord,
         cameras: &[Camera],
+        key: Option<&SubmissionKey>,
     ) -> Result<(), QueueError> {
+        let submitted_s = record.submitted_s;
         let record = self.text(record)?;
         self.write(|transaction| {
             transaction.open_table(META)?.insert("last", id.0)?;
+            if let Some(SubmissionKey { key, content }) = key {
+                let row = (id.0, submitted_s, content.0);
+                transaction.open_table(KEYS)?.insert(key.as_str(), row)?;
+            }
             transaction.open_table(SHOTS)?.insert(id.0, record.as_slice())?;
             let mut table = transaction.open_table(CAMERAS)?;
             for (piece, cameras) in (0..).zip(cameras.chunks(PIECE)) {
                 table.insert((id.0, piece), pack(cameras).as_slice())?;
             }
             Ok(())
+        })
+    }
+
+    /// The shot that was submitted under a key, and the hash of what was submitted.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn recall(&mut self, key: &str) -> Result<Option<(ShotId, BlobHash)>, QueueError> {
+        self.read(|transaction| {
+            let row = transaction.open_table(KEYS)?.get(key)?.map(|row| row.value());
+            Ok(row.map(|(shot, _, content)| (ShotId(shot), BlobHash(content))))
+        })
+    }
+
+    /// Forgets keys that are older than this many seconds since 1970; returns how many.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn forget_keys(&mut self, before_s: u64) -> Result<usize, QueueError> {
+        let old = self.read(|transaction| {
+            let mut old = Vec::new();
+            for row in transaction.open_table(KEYS)?.iter()? {
+                let (key, row) = row?;
+                if row.value().1 < before_s {
+                    old.push(key.value().to_owned());
+                }
+            }
+            Ok(old)
+        })?;
+        if old.is_empty() {
+            return Ok(0);
+        }
+        self.write(|transaction| {
+            let mut keys = transaction.open_table(KEYS)?;
+            for key in &old {
+                keys.remove(key.as_str())?;
+            }
+            Ok(old.len())
         })
     }
 
@@ -275,8 +228,9 @@ impl Ledger {
         })
     }
 
-    /// Forgets that these frames were finished: their pictures are not what they were.
-    /// Returns how far the shot is now.
+    /// Forgets that these frames were finished: their pictures are not what they should be,
+    /// or their records are damaged. Those that failed are left as they are. Returns how far the shot is now: all of its frames are
+    /// counted again, since nobody knows as what a damaged one was counted.
     ///
     /// # Errors
     /// If it cannot be written.
@@ -289,10 +243,19 @@ impl Ledger {
             let mut table = transaction.open_table(FRAMES)?;
             let mut shots = transaction.open_table(PROGRESS)?;
             let row = shots.get(shot.0)?.map(|row| row.value()).unwrap_or_default();
-            let mut progress = Progress::from_row(row);
+            let mut progress = Progress { done: 0, failed: 0, ..Progress::from_row(row) };
             for &index in frames {
-                if table.remove((shot.0, index))?.is_some() {
-                    progress.done = progress.done.saturating_sub(1);
+                let kept = table.get((shot.0, index))?;
+                let kept = kept.map(|text| FrameRecord::read(text.value()));
+                // One that could not be rendered has no pixels that could be wrong.
+                if !matches!(kept, Some(Some(FrameRecord::Failed(_)))) {
+                    table.remove((shot.0, index))?;
+                }
+            }
+            for row in table.range((shot.0, 0)..=(shot.0, u32::MAX))? {
+                match FrameRecord::read(row?.1.value()) {
+                    Some(FrameRecord::Failed(_)) => progress.failed += 1,
+                    Some(FrameRecord::Done { .. }) | None => progress.done += 1,
                 }
             }
             shots.insert(shot.0, progress.row())?;
@@ -300,29 +263,24 @@ impl Ledger {
         })
     }
 
-    /// What became of the frames of a shot, by index.
+    /// What became of the frames of a shot, by index; `None` where the record is damaged.
     ///
     /// # Errors
     /// If it cannot be read.
     pub fn frames(
         &mut self,
         shot: ShotId,
-    ) -> Result<BTreeMap<FrameIndex, FrameRecord>, QueueError> {
-        let rows = self.read(|transaction| {
+    ) -> Result<BTreeMap<FrameIndex, Option<FrameRecord>>, QueueError> {
+        self.read(|transaction| {
             let table = transaction.open_table(FRAMES)?;
             let range = table.range((shot.0, 0)..=(shot.0, u32::MAX))?;
-            range
-                .map(|row| row.map(|(key, text)| (key.value().1, text.value().to_vec())))
-                .collect::<Result<Vec<_>, _>>()
-                .map_err(redb::Error::from)
-        })?;
-        let parsed = rows.into_iter().map(|(index, text)| {
-            Ok((index, self.parse(&format!("frame {index} of {shot}"), &text)?))
-        });
-        parsed.collect()
+            let read = range
+                .map(|row| row.map(|(key, text)| (key.value().1, FrameRecord::read(text.value()))));
+            Ok(read.collect::<Result<_, _>>()?)
+        })
     }
 
-    /// What became of one frame.
+    /// What became of one frame; `Some(None)` where its record is damaged.
     ///
     /// # Errors
     /// If it cannot be read.
@@ -330,12 +288,11 @@ impl Ledger {
         &mut self,
         shot: ShotId,
         index: FrameIndex,
-    ) -> Result<Option<FrameRecord>, QueueError> {
-        let text = self.read(|transaction| {
+    ) -> Result<Option<Option<FrameRecord>>, QueueError> {
+        self.read(|transaction| {
             let table = transaction.open_table(FRAMES)?;
-            Ok(table.get((shot.0, index))?.map(|text| text.value().to_vec()))
-        })?;
-        text.map(|text| self.parse(&format!("frame {index} of {shot}"), &text)).transpose()
+            Ok(table.get((shot.0, index))?.map(|text| FrameRecord::read(text.value())))
+        })
     }
 
     /// The frames that are not over, each with its camera.
@@ -469,15 +426,6 @@ impl Ledger {
     fn text(&self, value: &impl Serialize) -> Result<Vec<u8>, QueueError> {
         serde_json::to_vec(value).map_err(|why| self.damaged(format!("cannot be written: {why}")))
     }
-
-    fn parse<T: for<'de> Deserialize<'de>>(
-        &self,
-        what: &str,
-        text: &[u8],
-    ) -> Result<T, QueueError> {
-        serde_json::from_slice(text)
-            .map_err(|why| self.damaged(format!("the record of {what} cannot be read: {why}")))
-    }
 }
 
 impl Drop for Ledger {
@@ -488,7 +436,8 @@ impl Drop for Ledger {
 
 /// Reads a shot from its values, and puts it into a book; for [`crate::fuzz`].
 pub(crate) fn is_shot_on_record(record: &[u8], row: (u32, u32, u32), cameras: &[u8]) -> bool {
-    let Ok(record) = serde_json::from_slice::<ShotRecord>(record) else { return false };
+    let is_sound = serde_json::from_slice::<ShotRecord>(record).is_ok();
+    let record = ShotRecord::read(record);
     let [width, height] = record.plan.size;
     let valid = unpack(cameras, (width, height)).filter(Camera::is_valid).count();
     let (id, progress) = (ShotId(1), Progress::from_row(row));
@@ -497,12 +446,12 @@ pub(crate) fn is_shot_on_record(record: &[u8], row: (u32, u32, u32), cameras: &[
     let _ = book.to_finish();
     let complete = book.get(id).is_some_and(super::book::Shot::is_complete);
     book.forget(id);
-    complete || valid > 0
+    is_sound && (complete || valid > 0)
 }
 
 /// Reads what became of a frame; for [`crate::fuzz`].
 pub(crate) fn is_frame_on_record(record: &[u8]) -> bool {
-    serde_json::from_slice::<FrameRecord>(record).is_ok()
+    FrameRecord::read(record).is_some()
 }
 
 fn pack(cameras: &[Camera]) -> Vec<u8> {

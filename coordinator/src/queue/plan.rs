@@ -107,6 +107,23 @@ impl ShotPlan {
         if frames == 0 || frames > FRAMES_MAX as usize {
             return unfit(format!("a shot has 1 to {FRAMES_MAX} cameras, this one {frames}"));
         }
+        self.check_kept(frames as u32)?;
+        if self.cameras.iter().any(|camera| [camera.width, camera.height] != self.size) {
+            return unfit(format!("not all of its cameras have {width} x {height} pixels"));
+        }
+        for cameras in self.cameras.chunks(CAMERAS_MAX) {
+            let piece: Message = Cameras { number: 0, first: 0, cameras: cameras.to_vec() }.into();
+            encode(NEWEST_VERSION, &piece).map(|_| ()).or_else(|why| unfit(why.to_string()))?;
+        }
+        Ok(())
+    }
+
+    /// As [`ShotPlan::check`], of a shot whose cameras, so many, are kept apart.
+    ///
+    /// # Errors
+    /// [`QueueError::Unfit`], with what is wrong.
+    pub(super) fn check_kept(&self, frames: u32) -> Result<(), QueueError> {
+        let unfit = |why: String| Err(QueueError::Unfit(why));
         if self.first_frame > FRAMES_MAX {
             return unfit(format!("its first frame is {}; at most {FRAMES_MAX}", self.first_frame));
         }
@@ -119,19 +136,12 @@ impl ShotPlan {
         if texts.into_iter().flatten().any(|text| text.len() > TEXT_BYTES_MAX) {
             return unfit(format!("a name in its source is longer than {TEXT_BYTES_MAX} bytes"));
         }
+        let [width, height] = self.size;
         self.check_size(width, height)?;
-        if self.cameras.iter().any(|camera| [camera.width, camera.height] != self.size) {
-            return unfit(format!("not all of its cameras have {width} x {height} pixels"));
-        }
         // What the wire would refuse is refused here, by the same rules.
-        let submit = self.submission(0, frames as u32);
+        let submit = self.submission(0, frames);
         let fits = encode(NEWEST_VERSION, &submit.into()).map(|_| ());
-        fits.or_else(|why| unfit(why.to_string()))?;
-        for cameras in self.cameras.chunks(CAMERAS_MAX) {
-            let piece: Message = Cameras { number: 0, first: 0, cameras: cameras.to_vec() }.into();
-            encode(NEWEST_VERSION, &piece).map(|_| ()).or_else(|why| unfit(why.to_string()))?;
-        }
-        Ok(())
+        fits.or_else(|why| unfit(why.to_string()))
     }
 
     fn check_size(&self, width: u32, height: u32) -> Result<(), QueueError> {
@@ -174,6 +184,8 @@ impl ShotPlan {
             frames,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
+            // What is left overnight has nobody who waits for each frame.
+            live: false,
         }
     }
 }

@@ -7,6 +7,7 @@
 //! frame of this one.
 
 mod close;
+mod doubt;
 mod show;
 mod stay;
 
@@ -16,11 +17,12 @@ use super::disk::{self, FolderLock};
 use super::ledger::{FrameRecord, Ledger, Progress, Saved, ShotRecord, Stage};
 use super::pictures::Unfinished;
 use super::{
-    Command, QueueConfig, QueueError, SHOTS_MAX, ShotFiles, ShotList, ShotPlan, blocking,
-    shot_folder,
+    Command, QueueConfig, QueueError, SHOTS_MAX, ShotFiles, ShotList, ShotPlan, SubmissionKey,
+    blocking, shot_folder,
 };
 use crate::driver::FarmLine;
 use crate::order::{Order, OrderError};
+use doubt::Doubted;
 use stay::{Picture, Stay, StayId};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::Ordering;
@@ -64,6 +66,8 @@ enum News {
     Lacks(StayId, BlobHash),
     /// The disk does not read terrain that the farm asks for.
     Unread(StayId, BlobHash),
+    /// Frames of a shot have pixels of a worker that is not believed any more.
+    Doubted(Doubted),
     /// A picture was written, or not.
     Stored(Picture, Result<u64, QueueError>),
     /// A shot was finished, or not.
@@ -101,6 +105,11 @@ pub(super) struct Task {
     outcomes: Vec<Outcome>,
     /// Pictures for which there was no room.
     unwritten: Vec<Picture>,
+    /// Frames on their way to the disk that are not believed any more: they are rendered
+    /// again. By shot, so that those of earlier stays are forgotten with a new one.
+    distrusted: BTreeSet<(ShotId, StayId, FrameIndex)>,
+    /// Doubts that the disk did not let be recorded.
+    doubts: Vec<Doubted>,
     /// Why nothing goes on: the disk is full or fails.
     stalled: Option<QueueError>,
     /// The shot whose film is being made, and what stops that when it is dropped.
@@ -152,6 +161,8 @@ impl Task {
             writers: Arc::new(Semaphore::new(WRITERS)),
             outcomes: Vec::new(),
             unwritten: Vec::new(),
+            distrusted: BTreeSet::new(),
+            doubts: Vec::new(),
             stalled: None,
             finishing: None,
             losses: BTreeMap::new(),
@@ -219,10 +230,11 @@ impl Task {
             }
             News::Lacks(stay, hash) => {
                 // It may have come since.
-                let is_here = self.shared.blobs.missing(vec![hash]).is_empty();
+                let is_here = self.is_here(hash).await;
                 self.lacks(stay, hash, !is_here).await;
             }
             News::Unread(stay, hash) => self.lacks(stay, hash, true).await,
+            News::Doubted(doubted) => self.doubt(doubted).await,
             News::Stored(picture, stored) => self.stored(picture, stored).await,
             News::Finished(shot, result) => self.finished(shot, result).await,
             News::Swept(result) => {
@@ -238,8 +250,11 @@ impl Task {
 
     async fn obey(&mut self, command: Command) {
         match command {
-            Command::Submit(plan, answer) => {
-                let submitted = self.submit(*plan).await;
+            Command::Recall(key, answer) => {
+                let _ = answer.send(self.recall(&key).await);
+            }
+            Command::Submit(plan, key, answer) => {
+                let submitted = self.submit(*plan, key).await;
                 self.publish();
                 // Who asked may have gone; the shot is there all the same.
                 let _ = answer.send(submitted);
@@ -260,7 +275,27 @@ impl Task {
         }
     }
 
-    async fn submit(&mut self, mut plan: ShotPlan) -> Result<ShotId, QueueError> {
+    /// The shot that was submitted with this key, if there was one.
+    async fn recall(&self, key: &SubmissionKey) -> Result<Option<ShotId>, QueueError> {
+        let SubmissionKey { key, content } = key.clone();
+        let text = key.clone();
+        match self.ledger(move |ledger| ledger.recall(&text)).await? {
+            Some((shot, before)) if before != content => Err(QueueError::KeyReused { key, shot }),
+            known => Ok(known.map(|(shot, _)| shot)),
+        }
+    }
+
+    async fn submit(
+        &mut self,
+        mut plan: ShotPlan,
+        key: Option<SubmissionKey>,
+    ) -> Result<ShotId, QueueError> {
+        // It may have come twice at the same time.
+        if let Some(key) = &key
+            && let Some(shot) = self.recall(key).await?
+        {
+            return Ok(shot);
+        }
         if self.book.unfinished() >= SHOTS_MAX {
             return Err(QueueError::Full);
         }
@@ -271,11 +306,12 @@ impl Task {
             stage: Stage::Open,
             note: String::new(),
             workers: Vec::new(),
+            history: Vec::new(),
             plan,
         };
         let id = ShotId(self.farm.last_shot().fetch_add(1, Ordering::Relaxed) + 1);
         let kept = record.clone();
-        self.ledger(move |ledger| ledger.add(id, &kept, &cameras)).await?;
+        self.ledger(move |ledger| ledger.add(id, &kept, &cameras, key.as_ref())).await?;
         tracing::info!(shot = %id, name = %record.plan.name, frames = record.frames, "queued");
         self.book.add(Saved { id, record, progress: Progress::default() });
         self.changed.insert(id);
@@ -333,8 +369,13 @@ impl Task {
         let last = first + frames.saturating_sub(1);
         let index = index.ok_or(QueueError::NoFrame { shot: id, first, last, frame })?;
         match self.ledger(move |ledger| ledger.frame(id, index)).await? {
-            Some(FrameRecord::Done { .. }) => return Ok("it is done".into()),
-            Some(FrameRecord::Failed(reason)) => return Ok(format!("it failed: {reason}")),
+            Some(Some(FrameRecord::Done { .. })) => return Ok("it is done".into()),
+            Some(Some(FrameRecord::Failed(reason))) => return Ok(format!("it failed: {reason}")),
+            Some(None) => {
+                return Ok(
+                    "its record is damaged: it is rendered again when the rest is done".into()
+                );
+            }
             None => {}
         }
         let view = self.view(id).ok_or(QueueError::NoShot(id))?;
@@ -366,6 +407,13 @@ impl Task {
     ) -> Result<T, QueueError> {
         let shared = self.shared.clone();
         blocking(move || shared.with_ledger(work)).await
+    }
+
+    /// Whether a blob of terrain can be had.
+    async fn is_here(&self, hash: BlobHash) -> bool {
+        let blobs = self.shared.blobs.clone();
+        let missing = blocking(move || Ok(blobs.missing(vec![hash]))).await;
+        missing.is_ok_and(|missing| missing.is_empty())
     }
 
     fn files(&self, id: ShotId, record: &ShotRecord) -> ShotFiles {

@@ -2,6 +2,7 @@
 //! of being cut off.
 #![allow(clippy::unwrap_used)]
 
+mod damaged;
 mod full;
 pub(crate) mod house;
 mod killed;
@@ -11,7 +12,9 @@ use super::*;
 use crate::sink::manifest::Manifest;
 use house::{House, Land, plan, until};
 use std::fs;
+use terrafarm_common::accuracy::Share;
 use terrafarm_common::id::WorkerId;
+use terrafarm_common::image::Rgb8;
 
 fn manifest(files: &ShotFiles) -> Manifest {
     serde_json::from_slice(&fs::read(files.manifest()).unwrap()).unwrap()
@@ -104,6 +107,62 @@ async fn damaged_terrain_stalls_a_shot_until_it_is_sent_again() {
     assert_eq!(house.queue.shot(shot).unwrap().frames_failed, 0);
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_submission_that_is_sent_again_with_its_key_is_the_shot_that_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let key = |key: &str, content: &[u8]| SubmissionKey::new(key, content).unwrap();
+    let (first, second) = (key("k-1", b"hills"), key("k-2", b"hills"));
+    let (one, other) = tokio::join!(
+        house.queue.submit_once(plan(&land, 2), first.clone()),
+        house.queue.submit_once(plan(&land, 2), first.clone()),
+    );
+    assert_eq!((one.unwrap(), other.unwrap()), (ShotId(1), ShotId(1)), "at the same time");
+    assert_eq!(house.queue.submit_once(plan(&land, 2), second).await.unwrap(), ShotId(2));
+    house.queue.order(Order::Cancel(ShotId(1))).await.unwrap();
+    for (hash, _) in &land.blobs {
+        fs::remove_file(folder.path().join("blobs").join(&hash.to_hex()[..2]).join(hash.to_hex()))
+            .unwrap();
+    }
+    for _ in 0..2 {
+        // Over by now, and without its terrain: it was taken all the same.
+        assert_eq!(
+            house.queue.submit_once(plan(&land, 2), first.clone()).await.unwrap(),
+            ShotId(1)
+        );
+        let reused = house.queue.submit_once(plan(&land, 2), key("k-1", b"valley")).await;
+        let shot = ShotId(1);
+        assert!(matches!(reused, Err(QueueError::KeyReused { shot: of, .. }) if of == shot));
+        house = house.restart().await;
+    }
+    assert_eq!(house.queue.shots().len(), 2);
+    for bad in ["", "a b", "\u{fc}", &"x".repeat(KEY_BYTES_MAX + 1)] {
+        assert!(SubmissionKey::new(bad, b"").is_err(), "{bad:?}");
+    }
+}
+
+#[test]
+fn keys_of_submissions_are_forgotten_when_they_are_old_and_not_before() {
+    use ledger::{Ledger, ShotRecord, Stage};
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
+    for (number, submitted_s) in [(1, 100), (2, 200), (3, 300)] {
+        let (note, workers, history) = (String::new(), Vec::new(), Vec::new());
+        let plan = plan(&land, 1);
+        let (frames, stage) = (1, Stage::Open);
+        let record = ShotRecord { plan, frames, submitted_s, stage, note, workers, history };
+        let key = SubmissionKey::new(&format!("k-{number}"), b"").unwrap();
+        ledger.add(ShotId(number), &record, &[], Some(&key)).unwrap();
+    }
+    assert_eq!(ledger.forget_keys(100).unwrap(), 0);
+    assert_eq!(ledger.forget_keys(201).unwrap(), 2);
+    assert_eq!(ledger.recall("k-2").unwrap(), None);
+    assert_eq!(ledger.recall("k-3").unwrap().unwrap().0, ShotId(3));
+}
+
 #[cfg(target_os = "linux")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn terrain_that_the_disk_does_not_read_is_waited_for_and_fails_no_frame() {
@@ -165,6 +224,42 @@ async fn damaged_pictures_are_rendered_again_before_the_film_is_made() {
     let rendered = house.rendered();
     assert_eq!(rendered.iter().filter(|&&frame| frame == done).count(), 2, "{rendered:?}");
     assert_eq!(manifest(&files).frames.len(), 4);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn frames_of_a_worker_that_an_audit_finds_at_fault_are_rendered_again() {
+    const FRAMES: u32 = 60;
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut farm = crate::Config::default();
+    farm.scheduler.audit = Share::from_millionths(1_000_000).unwrap();
+    let house = House::with_farm(house::config(folder.path()), farm).await;
+    land.send(&house.queue).await;
+    let mut plan = plan(&land, FRAMES);
+    (plan.film, plan.frames_in_flight) = (Some(Film::Mp4), 16);
+    let shot = house.queue.submit(plan).await.unwrap();
+    // Alone it is not audited, and what it sends is finished.
+    let permits = Arc::new(tokio::sync::Semaphore::new(5));
+    let _liar = house.hire_liar(WorkerId(1), permits.clone()).await;
+    until(&house.queue, |list| list[0].frames_done == 5).await;
+    let _honest = [house.hire(WorkerId(2)).await, house.hire(WorkerId(3)).await];
+    until(&house.queue, |list| list[0].frames_done >= 10).await;
+    permits.add_permits(FRAMES as usize);
+    until(&house.queue, |list| list[0].state == ShotState::Done).await;
+    let view = house.queue.shot(shot).unwrap();
+    assert_eq!((view.frames_done, view.frames_failed, view.film), (FRAMES, 0, true));
+    let what = &view.history[0].what;
+    assert!(what.contains("rendered again") && what.contains("worker-1"), "{what}");
+    let files = house.queue.files(shot).unwrap();
+    for frame in &manifest(&files).frames {
+        let pixels = vec![frame.index as u8; (house::SIZE.0 * house::SIZE.1 * 3) as usize];
+        let right = Rgb8::from_pixels(house::SIZE.0, house::SIZE.1, pixels).unwrap();
+        let hash = crate::sink::pixels_sha256(&right).to_hex();
+        assert_eq!(frame.sha256, hash, "frame {}", frame.index);
+    }
+    // It is remembered with the shot.
+    let house = house.restart().await;
+    assert_eq!(house.queue.shot(shot).unwrap().history, view.history);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -41,6 +41,7 @@ fn night() -> Vec<(u32, Event)> {
         split: Split::default(),
         priority: 0,
         frames_in_flight: 2,
+        live: true,
     };
     let done = |lease| Event::JobDone { worker, lease: LeaseId(lease), cost_us: 900, digest: 1 };
     let failed = Event::JobFailed { worker, lease: LeaseId(2), reason: "no".to_owned() };

@@ -10,7 +10,7 @@ use terrafarm_raycast::{Rendered, Stats, Unfit, Unseen, View};
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_wire::Message;
 use terrafarm_wire::link::{Connection, FarmToken, Trust, accept};
-use terrafarm_wire::message::{Blob, Hello, NoBlob, WantBlobs};
+use terrafarm_wire::message::{Blob, Hello, NoBlob, Pong, WantBlobs};
 use terrafarm_worker::office::Rules;
 use terrafarm_worker::render::Scene;
 use terrafarm_worker::{
@@ -102,13 +102,16 @@ impl Peer {
         self.connection.send(&message.into()).await.unwrap();
     }
 
-    /// The next message that does not say how fast the worker is, or how it is off; `None` at
-    /// a clean end.
+    /// The next message that does not say how fast the worker is, how it is off, or unasked
+    /// that it lives; `None` at a clean end.
     pub async fn recv(&mut self) -> Option<Message> {
         loop {
             let received = tokio::time::timeout(PATIENCE, self.connection.recv());
             let message = received.await.expect("the worker says something").unwrap();
-            if !matches!(message, Some(Message::Speed(_) | Message::Status(_))) {
+            let unasked = Pong { number: 0 }.into();
+            if !matches!(message, Some(Message::Speed(_) | Message::Status(_)))
+                && message.as_ref() != Some(&unasked)
+            {
                 return message;
             }
         }

@@ -1,10 +1,11 @@
 use crate::scene::{SIZE, Terrain, grant, whole};
-use crate::script::{Coordinator, gated, start, start_with};
+use crate::script::{Coordinator, PATIENCE, gated, start, start_with};
 use terrafarm_common::accuracy::{Share, Summary};
-use terrafarm_common::id::LeaseId;
+use terrafarm_common::id::{BlobHash, LeaseId};
 use terrafarm_common::region::{Region, columns};
 use terrafarm_wire::Message;
-use terrafarm_wire::message::{Drain, OpenShot, Ping, Pong, Role};
+use terrafarm_wire::link::{Paced, accept};
+use terrafarm_wire::message::{Blob, Drain, OpenShot, Ping, Pong, Role};
 use terrafarm_worker::Ended;
 
 #[tokio::test]
@@ -120,6 +121,29 @@ async fn a_heartbeat_is_answered_while_a_job_renders() {
     assert_eq!(peer.recv().await, Some(Pong { number: 2 }.into()), "the job still renders");
     gate.open(1);
     assert!(matches!(peer.recv().await, Some(Message::Done(_))));
+    drop(running.stop);
+    running.ended.abort();
+}
+
+#[tokio::test]
+async fn a_worker_says_that_it_lives_while_a_long_message_comes_and_is_not_asked() {
+    let coordinator = Coordinator::new().await;
+    let running = start(coordinator.config(None));
+    let (stream, _) = coordinator.listener.accept().await.unwrap();
+    // 4 MB a second: it takes a quarter of a second.
+    let slow = Paced::new(stream, Some(4_000_000));
+    let greeting = accept(slow, None, "terrafarm test", PATIENCE).await.unwrap();
+    let (connection, _) = greeting.welcome(1, "tower", PATIENCE / 3, PATIENCE).await.unwrap();
+    let (mut reader, mut writer) = connection.split();
+    let bytes = vec![1; 1 << 20].into();
+    writer.send(&Blob { hash: BlobHash([1; 32]), bytes }.into()).await.unwrap();
+    let unasked = loop {
+        match reader.recv().await.unwrap() {
+            Some(Message::Speed(_) | Message::Status(_)) => {}
+            other => break other,
+        }
+    };
+    assert_eq!(unasked, Some(Pong { number: 0 }.into()));
     drop(running.stop);
     running.ended.abort();
 }

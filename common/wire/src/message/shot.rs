@@ -49,6 +49,9 @@ pub struct Submit {
     pub frames_in_flight: u32,
     /// Shots of a higher priority get every worker they can use; equals take turns.
     pub priority: i32,
+    /// Whether somebody waits for each frame: then a worker that falls silent is noticed
+    /// within half a second.
+    pub live: bool,
 }
 
 /// Twin of [`Submit`].
@@ -65,6 +68,7 @@ pub(crate) struct SubmitTwin {
     frames: u32,
     frames_in_flight: u32,
     priority: i32,
+    live: bool,
 }
 
 impl Body for Submit {
@@ -83,6 +87,7 @@ impl Body for Submit {
             frames: self.frames,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
+            live: self.live,
         }
     }
 
@@ -100,6 +105,7 @@ impl Body for Submit {
             frames: wire.frames,
             frames_in_flight: wire.frames_in_flight,
             priority: wire.priority,
+            live: wire.live,
         })
     }
 

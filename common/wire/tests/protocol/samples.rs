@@ -151,6 +151,7 @@ pub fn all() -> Vec<(String, Message)> {
             frames: 600,
             frames_in_flight: 4,
             priority: -3,
+            live: true,
         }
         .into(),
         Cameras { number, first: frame, cameras: vec![camera(); 2] }.into(),
@@ -344,6 +345,7 @@ pub fn any_message() -> impl Strategy<Value = Message> {
                 frames,
                 frames_in_flight: 1 + frames % 1024,
                 priority: frames as i32 - 1000,
+                live: frames % 3 == 0,
             }
             .into()
         },

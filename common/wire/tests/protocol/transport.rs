@@ -6,7 +6,8 @@ use terrafarm_common::id::BlobHash;
 use terrafarm_wire::Message;
 use terrafarm_wire::limits::PART_BYTES;
 use terrafarm_wire::link::{
-    Connection, FarmToken, HandshakeError, LinkError, Unsent, accept, greet, outbox,
+    Connection, FarmToken, HandshakeError, Heard, LinkError, Paced, Unsent, WHILE_IT_COMES, accept,
+    greet, outbox,
 };
 use terrafarm_wire::message::*;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, DuplexStream, duplex};
@@ -246,6 +247,74 @@ async fn silence_is_noticed_although_the_receive_is_cancelled_all_the_time() {
             }
         }
     }
+}
+
+/// A tile of a megabyte over 10 Mbit/s takes most of a second.
+async fn a_long_message_is_heard_of_while_it_comes(token: Token) {
+    let (near, far) = memory();
+    let pair = (Paced::new(near, Some(1_250_000)), Paced::new(far, None));
+    let (worker, coordinator) = connect_by(pair, token).await;
+    let (_keep, mut writer) = worker.split();
+    let (mut reader, _keep_too) = coordinator.split();
+    let tile: Message = Blob { hash: BlobHash([4; 32]), bytes: vec![3; PART_BYTES].into() }.into();
+    let sent = tile.clone();
+    let began = tokio::time::Instant::now();
+    let sending = tokio::spawn(async move {
+        writer.send(&sent).await.unwrap();
+        // Short ones are heard of when they are there.
+        for number in 0..10 {
+            writer.send(&Ping { number }.into()).await.unwrap();
+        }
+        writer.close().await.unwrap();
+    });
+    let (mut heard_at, mut more) = (began, 0);
+    loop {
+        let heard = reader.hear(Some(LIMIT)).await.unwrap();
+        let silence = heard_at.elapsed();
+        assert!(silence <= 2 * WHILE_IT_COMES, "silent for {silence:?} after {more}");
+        heard_at = tokio::time::Instant::now();
+        match heard {
+            Heard::More => more += 1,
+            Heard::Claim(_) => {}
+            Heard::Message(message) => {
+                assert_eq!(message, tile);
+                break;
+            }
+            Heard::End => panic!("ended after {more}"),
+        }
+    }
+    assert!((8..=17).contains(&more), "{more} in {:?}", began.elapsed());
+    for number in 0..10 {
+        let ping = Heard::Message(Ping { number }.into());
+        assert_eq!(reader.hear(None).await.unwrap(), ping);
+    }
+    assert_eq!(reader.hear(None).await.unwrap(), Heard::End);
+    sending.await.unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_long_message_is_heard_of_while_it_comes_over_plain_and_secure_links() {
+    for token in [None, Some(token())] {
+        a_long_message_is_heard_of_while_it_comes(token).await;
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn half_a_message_that_comes_no_further_is_silence() {
+    let (near, far) = memory();
+    let (mut worker, coordinator) = connect((near, far)).await;
+    let (mut reader, _keep) = coordinator.split();
+    let long: Message = Blob { hash: BlobHash([4; 32]), bytes: vec![3; 1 << 20].into() }.into();
+    let silence = 4 * WHILE_IT_COMES;
+    let sending = tokio::spawn(async move {
+        // Its writer has room for a part of it only, and is dropped in the middle.
+        let _ = tokio::time::timeout(WHILE_IT_COMES, worker.send(&long)).await;
+        worker
+    });
+    let worker = sending.await.unwrap();
+    let stopped = reader.hear(Some(silence)).await;
+    assert!(matches!(stopped, Err(LinkError::Silent(_))), "{stopped:?}");
+    drop(worker);
 }
 
 #[tokio::test(start_paused = true)]

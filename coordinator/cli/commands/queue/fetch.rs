@@ -37,7 +37,7 @@ pub fn run(args: &args::Fetch) -> anyhow::Result<Outcome> {
 /// All frames of a shot into a folder; its manifest comes last.
 async fn frames(desk: &mut Desk, shot: &str, folder: &Path) -> anyhow::Result<Outcome> {
     let path = format!("{shot}/manifest.json");
-    let text = desk.line.ask(Verb::Get, &path, None, Default::default()).await?.body;
+    let text = desk.ask(Verb::Get, &path, Default::default()).await?.body;
     let manifest: Manifest = serde_json::from_slice(&text)
         .context("the manifest is not understood; is the coordinator of the same version?")?;
     fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
@@ -93,8 +93,8 @@ async fn download(desk: &mut Desk, from: &str, to: &Path) -> anyhow::Result<u64>
         file.set_len(here).with_context(|| cannot("write", &part))?;
     }
     loop {
-        let answer =
-            desk.line.ask(Verb::Get, from, Some((here, PIECE_BYTES)), Default::default()).await;
+        let (range, body) = (Some((here, PIECE_BYTES)), Default::default());
+        let answer = desk.line.ask_again(Verb::Get, from, range, body, &desk.turn).await;
         let answer = match answer {
             Ok(answer) => answer,
             Err(why) => {

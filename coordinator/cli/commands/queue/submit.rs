@@ -13,7 +13,7 @@ use std::collections::HashSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use terrafarm_common::id::{BlobHash, ShotId};
-use terrafarm_coordinator::ask::Line;
+use terrafarm_coordinator::ask::{Line, Turn};
 use terrafarm_coordinator::queue::{Film, MISSING_MAX, ShotPlan, Source, parse_hash};
 use terrafarm_coordinator::view::{ShotState, ShotView};
 use terrafarm_terrain::store::StoreReader;
@@ -21,7 +21,8 @@ use terrafarm_wire::limits::clip_name;
 use terrafarm_wire::message::Verb;
 use tokio::task::JoinSet;
 
-/// Blobs that are sent at once, each over a line of its own.
+/// Blobs that are sent at once, each over a line of its own, if the coordinator has places for
+/// so many.
 const LINES: usize = 4;
 /// How often a shot that is waited for is looked at.
 const LOOK: Duration = Duration::from_secs(1);
@@ -39,7 +40,9 @@ pub fn run(args: &args::Submit) -> anyhow::Result<Outcome> {
             shot: ShotId,
         }
         let body = serde_json::to_vec(&shot).context("cannot write the shot as JSON")?;
-        let answer = desk.line.ask(Verb::Post, "/api/v1/shots", None, body.into()).await?;
+        // If the answer is lost, the same is sent again, and is the same shot.
+        let path = format!("/api/v1/shots?idempotency_key={}", fresh_key()?);
+        let answer = desk.ask(Verb::Post, &path, body.into()).await?;
         let Taken { shot: id } = read(&answer)?;
         if !args.wait {
             return match args.json {
@@ -61,6 +64,13 @@ pub fn run(args: &args::Submit) -> anyhow::Result<Outcome> {
             _ => bail!("{id} is {}: {}", over.state.name(), over.note),
         }
     })
+}
+
+/// A key that nobody else draws.
+fn fresh_key() -> anyhow::Result<String> {
+    let mut bytes = [0; 16];
+    getrandom::fill(&mut bytes).context("the system gives no random numbers")?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
 fn shot_plan(args: &args::Submit, plan: Plan) -> ShotPlan {
@@ -109,47 +119,62 @@ async fn send_terrain(desk: &mut Desk, store: &Arc<StoreReader>) -> anyhow::Resu
     for some in hashes.chunks(MISSING_MAX) {
         let texts: Vec<_> = some.iter().map(|hash| hash.to_hex()).collect();
         let body = json!(texts).to_string().into();
-        let answer = desk.line.ask(Verb::Post, "/api/v1/blobs/missing", None, body).await?;
+        let answer = desk.ask(Verb::Post, "/api/v1/blobs/missing", body).await?;
         let Missing { missing: texts } = read(&answer)?;
         for text in texts {
             missing.push(parse_hash(&text).context("the coordinator asks for no hash")?);
         }
     }
-    let bar = progress::bar("terrain", missing.len() as u64);
-    let left = Arc::new(Mutex::new(missing));
+    let more_lines = missing.len().min(LINES).saturating_sub(1);
+    let load = Load {
+        store: store.clone(),
+        bar: progress::bar("terrain", missing.len() as u64),
+        left: Arc::new(Mutex::new(missing)),
+        turn: desk.turn.clone(),
+    };
     let mut senders = JoinSet::new();
-    for _ in 0..LINES {
-        let line = desk.another().await?;
-        senders.spawn(send(line, store.clone(), left.clone(), bar.clone()));
+    for _ in 0..more_lines {
+        let Some(mut line) = desk.another().await? else { break };
+        let load = load.clone();
+        senders.spawn(async move { load.send(&mut line).await });
     }
+    load.send(&mut desk.line).await?;
     while let Some(sent) = senders.join_next().await {
         sent.context("a task that sends terrain ended early")??;
     }
-    bar.finish_and_clear();
+    load.bar.finish_and_clear();
     Ok(())
 }
 
-/// Sends blobs until none is left.
-async fn send(
-    mut line: Line,
+/// Blobs that are to be sent.
+#[derive(Clone)]
+struct Load {
     store: Arc<StoreReader>,
     left: Arc<Mutex<Vec<BlobHash>>>,
     bar: indicatif::ProgressBar,
-) -> anyhow::Result<()> {
-    loop {
-        let next = left.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let Some(hash) = next else { return Ok(()) };
-        let from = store.clone();
-        let read = move || -> anyhow::Result<Bytes> {
-            let (index_hash, index) = from.index_blob();
-            match hash == index_hash {
-                true => Ok(Bytes::copy_from_slice(index)),
-                false => Ok(from.read_blob(&hash)?.into()),
-            }
-        };
-        let bytes = tokio::task::spawn_blocking(read).await.context("reading terrain failed")??;
-        line.ask(Verb::Put, &format!("/api/v1/blobs/{}", hash.to_hex()), None, bytes).await?;
-        bar.inc(1);
+    turn: Arc<Turn>,
+}
+
+impl Load {
+    /// Sends blobs until none is left.
+    async fn send(&self, line: &mut Line) -> anyhow::Result<()> {
+        loop {
+            let next = self.left.lock().unwrap_or_else(PoisonError::into_inner).pop();
+            let Some(hash) = next else { return Ok(()) };
+            let from = self.store.clone();
+            let read = move || -> anyhow::Result<Bytes> {
+                let (index_hash, index) = from.index_blob();
+                match hash == index_hash {
+                    true => Ok(Bytes::copy_from_slice(index)),
+                    false => Ok(from.read_blob(&hash)?.into()),
+                }
+            };
+            let read = tokio::task::spawn_blocking(read).await;
+            let bytes = read.context("reading terrain failed")??;
+            let path = format!("/api/v1/blobs/{}", hash.to_hex());
+            line.ask_again(Verb::Put, &path, None, bytes, &self.turn).await?;
+            self.bar.inc(1);
+        }
     }
 }
 

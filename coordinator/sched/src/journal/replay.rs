@@ -204,6 +204,8 @@ fn check(config: &Config) -> Result<(), ReplayError> {
         config.lease_floor_us,
         config.heartbeat_us,
         config.silence_us,
+        config.live_heartbeat_us,
+        config.live_silence_us,
     ];
     let is_factor = config.lease_factor >= 0.0 && config.lease_factor <= 1e6;
     let fits = [
@@ -244,7 +246,7 @@ impl Night {
             build,
             seed,
             scheduler: Scheduler::new(config.clone(), seed),
-            judge: Judge::default(),
+            judge: Judge::new(config),
             chain: Chain::default(),
             now: Micros(0),
             events: 0,
@@ -263,7 +265,10 @@ impl Night {
         self.proved = self.events;
         self.events += 1;
         self.now = self.now.after(after_us);
-        self.judge.event(&event);
+        if self.scheduler.overslept(self.now) {
+            self.judge.overslept(self.now);
+        }
+        self.judge.event(self.now, &event);
         self.told = Some(event.clone());
         self.asked.clear();
         self.scheduler.handle(self.now, event);
@@ -274,7 +279,7 @@ impl Night {
             self.failed_frames += u64::from(matches!(action, Action::FrameFailed { .. }));
             self.asked.push(action);
         }
-        self.judge.settled();
+        self.judge.settled(self.now);
         self.workers = self.workers.max(self.scheduler.workers());
     }
 

@@ -24,6 +24,7 @@ fn submitted() -> Event {
         split: Split::Columns,
         priority: -1,
         frames_in_flight: 2,
+        live: true,
     }
 }
 
@@ -185,6 +186,7 @@ fn settings_that_no_scheduler_can_work_with_are_refused() {
         Config { queue_depth: usize::MAX, ..Config::default() },
         Config { lease_factor: f64::NAN, ..Config::default() },
         Config { heartbeat_us: u64::MAX, ..Config::default() },
+        Config { live_silence_us: u64::MAX, ..Config::default() },
         Config { max_job_px: 0, ..Config::default() },
     ];
     for config in bad {
@@ -240,7 +242,7 @@ fn a_disk_that_is_full_ends_the_journal_and_not_the_farm() {
 }
 
 #[test]
-fn the_bytes_of_version_1_are_these() {
+fn the_bytes_of_version_2_are_these() {
     let journal = journal_of([
         Record::Start { build: "0.1.0".into(), config: Config::default(), seed: 9 },
         Record::Event { after_us: 300, before: 0, event: joined(1) },
@@ -251,7 +253,7 @@ fn the_bytes_of_version_1_are_these() {
     let hash = xxhash_rust::xxh3::xxh3_64(&journal);
     assert_eq!(
         (journal.len(), hash),
-        (123, 5_158_387_147_918_639_266),
+        (130, 5_085_232_544_417_095_315),
         "the layout changed: raise the version"
     );
 }

@@ -3,7 +3,9 @@
 //! It sees the same events and actions as any driver and keeps books of its own, so that
 //! an error in the scheduler's books cannot hide itself.
 
-use crate::event::{Action, Event};
+use super::silence::Silence;
+use crate::config::Config;
+use crate::event::{Action, Event, Micros};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use terrafarm_common::id::{FrameIndex, LeaseId, ShotId, WorkerId};
@@ -34,6 +36,8 @@ pub struct Violations {
     pub in_flight: u64,
     /// Shots that ended with a wrong count of frames, or did not end.
     pub unfinished: u64,
+    /// Workers still counted on after so much silence while somebody waited for frames.
+    pub unnoticed: u64,
     /// Failures of the scheduler's own check.
     pub self_check: u64,
 }
@@ -53,6 +57,8 @@ struct Picture {
 
 #[derive(Debug)]
 struct Watched {
+    is_live: bool,
+    is_paused: bool,
     frames: u32,
     size: (u32, u32),
     limit: u32,
@@ -64,7 +70,7 @@ struct Watched {
 }
 
 /// The judge of one run.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Judge {
     /// The counts.
     pub(crate) violations: Violations,
@@ -81,14 +87,42 @@ pub(crate) struct Judge {
     held_by: BTreeMap<WorkerId, BTreeSet<LeaseId>>,
     last_lease: u64,
     awaiting: Option<(WorkerId, LeaseId)>,
+    silence: Silence,
 }
 
 impl Judge {
+    /// The judge of a run that has not begun, of a scheduler with these settings.
+    pub(crate) fn new(config: &Config) -> Self {
+        Judge {
+            violations: Violations::default(),
+            first: None,
+            copies: 0,
+            workers: BTreeMap::new(),
+            distrusted: BTreeSet::new(),
+            shots: BTreeMap::new(),
+            held: BTreeMap::new(),
+            held_by: BTreeMap::new(),
+            last_lease: 0,
+            awaiting: None,
+            silence: Silence::new(config.live_silence_us),
+        }
+    }
+
+    /// Takes note that the owner of the scheduler comes too late to look, before it tells
+    /// what happened.
+    pub(crate) fn overslept(&mut self, now: Micros) {
+        self.silence.overslept(now);
+    }
+
     /// Takes note of an event before it is handled.
-    pub(crate) fn event(&mut self, event: &Event) {
+    pub(crate) fn event(&mut self, now: Micros, event: &Event) {
+        if let Some(worker) = speaker(event) {
+            self.silence.heard(now, worker);
+        }
         match event {
             Event::WorkerJoined { worker, .. } => {
                 self.workers.entry(*worker).or_insert(false);
+                self.silence.joined(now, *worker);
             }
             Event::WorkerLost { worker, .. } => self.gone(*worker),
             Event::WorkerDraining { worker } => {
@@ -101,8 +135,12 @@ impl Judge {
                 leases.iter().for_each(|&lease| self.give_up(*worker, lease));
             }
             Event::JobFailed { worker, lease, .. } => self.give_up(*worker, *lease),
-            Event::ShotSubmitted { shot, frames, width, height, frames_in_flight, .. } => {
+            Event::ShotSubmitted {
+                shot, frames, width, height, frames_in_flight, live, ..
+            } => {
                 self.shots.entry(*shot).or_insert_with(|| Watched {
+                    is_live: *live,
+                    is_paused: false,
                     frames: *frames,
                     size: (*width, *height),
                     limit: *frames_in_flight,
@@ -121,9 +159,9 @@ impl Judge {
             }
             Event::WorkerCleared { worker, .. } => _ = self.distrusted.remove(worker),
             Event::ShotCanceled { shot } => _ = self.shots.remove(shot),
-            Event::ShotPaused { .. }
-            | Event::ShotResumed { .. }
-            | Event::ShotPrioritised { .. }
+            Event::ShotPaused { shot } => self.set_paused(*shot, true),
+            Event::ShotResumed { shot } => self.set_paused(*shot, false),
+            Event::ShotPrioritised { .. }
             | Event::WorkerDistrusted { .. }
             | Event::WorkerMeasured { .. }
             | Event::HeardFrom { .. }
@@ -207,8 +245,20 @@ impl Judge {
         }
     }
 
+    fn set_paused(&mut self, shot: ShotId, is_paused: bool) {
+        if let Some(shot) = self.shots.get_mut(&shot) {
+            shot.is_paused = is_paused;
+        }
+    }
+
     /// Takes note that all actions of an event have been seen.
-    pub(crate) fn settled(&mut self) {
+    pub(crate) fn settled(&mut self, now: Micros) {
+        let is_live = self.shots.values().any(|shot| shot.is_live && !shot.is_paused);
+        self.silence.live(now, is_live);
+        if let Some((worker, us)) = self.silence.overdue(now) {
+            let words = || format!("{worker} was silent for {us} us and nobody noticed");
+            self.expect(false, |v| &mut v.unnoticed, words);
+        }
         let forgotten = self.awaiting.take();
         self.expect(
             forgotten.is_none(),
@@ -347,6 +397,7 @@ impl Judge {
     fn gone(&mut self, worker: WorkerId) {
         // Another connection of the same number is another worker.
         self.distrusted.remove(&worker);
+        self.silence.gone(worker);
         if self.workers.remove(&worker).is_none() {
             return;
         }
@@ -374,85 +425,22 @@ impl Judge {
     }
 }
 
+/// The worker that an event is a word of.
+fn speaker(event: &Event) -> Option<WorkerId> {
+    match event {
+        Event::WorkerMeasured { worker, .. }
+        | Event::WorkerDraining { worker }
+        | Event::HandedBack { worker, .. }
+        | Event::JobDone { worker, .. }
+        | Event::JobFailed { worker, .. }
+        | Event::HeardFrom { worker } => Some(*worker),
+        _ => None,
+    }
+}
+
 fn overlap(a: Region, b: Region) -> bool {
     a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::event::LostReason;
-
-    const WORKER: WorkerId = WorkerId(1);
-    const SHOT: ShotId = ShotId(1);
-    const WHOLE: Region = Region { x: 0, y: 0, width: 16, height: 8 };
-
-    fn watching() -> Judge {
-        let mut judge = Judge::default();
-        judge.event(&Event::WorkerJoined { worker: WORKER, threads: 1 });
-        judge.event(&Event::ShotSubmitted {
-            shot: SHOT,
-            frames: 2,
-            width: 16,
-            height: 8,
-            split: Default::default(),
-            priority: 0,
-            frames_in_flight: 1,
-        });
-        judge
-    }
-
-    fn grant(lease: u64, frame: FrameIndex) -> Action {
-        Action::Grant { worker: WORKER, lease: LeaseId(lease), shot: SHOT, frame, region: WHOLE }
-    }
-
-    fn accept(judge: &mut Judge, lease: u64) {
-        let lease = LeaseId(lease);
-        judge.event(&Event::JobDone { worker: WORKER, lease, cost_us: 1, digest: 0 });
-        judge.action(&Action::Accept { lease, shot: SHOT, frame: 0, region: WHOLE });
-    }
-
-    #[test]
-    fn an_honest_run_is_clean() {
-        let mut judge = watching();
-        judge.action(&grant(1, 0));
-        accept(&mut judge, 1);
-        judge.action(&Action::FrameComplete { shot: SHOT, frame: 0 });
-        judge.settled();
-        assert!(judge.violations.is_clean(), "{:?}", judge.first);
-    }
-
-    #[test]
-    fn each_crime_is_counted() {
-        let mut judge = watching();
-        judge.action(&grant(1, 0));
-        judge.action(&grant(1, 0));
-        assert_eq!(judge.violations.lease_order, 1);
-        judge.action(&grant(2, 0));
-        judge.action(&grant(3, 0));
-        assert_eq!(judge.violations.held_twice, 1);
-        judge.action(&grant(4, 1));
-        assert_eq!(judge.violations.in_flight, 1);
-        accept(&mut judge, 3);
-        accept(&mut judge, 3);
-        assert_eq!(judge.violations.verdicts, 1);
-        assert_eq!(judge.violations.pixels_twice, 1);
-        judge.event(&Event::JobDone { worker: WORKER, lease: LeaseId(4), cost_us: 1, digest: 0 });
-        judge.settled();
-        assert_eq!(judge.violations.verdicts, 2);
-        judge.action(&Action::FrameComplete { shot: SHOT, frame: 1 });
-        assert_eq!(judge.violations.pixels_missing, 1);
-        judge.action(&Action::FrameComplete { shot: SHOT, frame: 1 });
-        assert_eq!(judge.violations.frames_twice, 1);
-        judge.event(&Event::WorkerDraining { worker: WORKER });
-        judge.action(&grant(5, 0));
-        assert_eq!(judge.violations.bad_grants, 1);
-        judge.event(&Event::WorkerLost { worker: WORKER, why: LostReason::Broken });
-        accept(&mut judge, 5);
-        assert_eq!(judge.violations.zombie_pixels, 1);
-        judge.action(&grant(6, 0));
-        judge.ended(99);
-        assert_eq!(judge.violations.unfinished, 1);
-        assert_eq!(judge.violations.lease_ends, 1);
-    }
-}
+mod tests;

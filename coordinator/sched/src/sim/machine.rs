@@ -48,6 +48,8 @@ pub(crate) struct Machine {
     pub(crate) cut_until_us: u64,
     /// Its program does nothing before this time.
     pub(crate) hangs_until_us: u64,
+    /// When the last cut or hang began that left it without a word.
+    pub(crate) mute_since_us: u64,
     /// When its link has sent all that it was given.
     pub(crate) sent_at_us: u64,
     /// Renders nothing any more.
@@ -85,6 +87,7 @@ impl Machine {
             running: None,
             cut_until_us: 0,
             hangs_until_us: 0,
+            mute_since_us: 0,
             sent_at_us: 0,
             is_stuck: false,
             is_unfit: !is_spared && rng.unit() < config.faults.unfit,
@@ -92,6 +95,21 @@ impl Machine {
             rendered_us: 0,
             faults,
         }
+    }
+
+    /// It hangs, or its link is cut, until this time; it may have been so before.
+    pub(crate) fn mute(&mut self, now_us: u64, until_us: u64, is_cut: bool) {
+        if self.hangs_until_us.max(self.cut_until_us) <= now_us {
+            self.mute_since_us = now_us;
+        }
+        let until = if is_cut { &mut self.cut_until_us } else { &mut self.hangs_until_us };
+        *until = until_us.max(*until);
+    }
+
+    /// Since when it hangs or is cut off, if it is now and this is its connection.
+    pub(crate) fn mute_since(&self, now_us: u64, connection: WorkerId) -> Option<u64> {
+        let is_mute = self.hangs_until_us.max(self.cut_until_us) > now_us;
+        (is_mute && self.connection == Some(connection)).then_some(self.mute_since_us)
     }
 
     /// It has no jobs any more, and knows of none.

@@ -10,6 +10,7 @@ mod fault;
 mod field;
 pub(crate) mod judge;
 mod machine;
+mod silence;
 mod tally;
 mod workers;
 mod world;
@@ -40,6 +41,8 @@ pub struct SimConfig {
     pub seed: u64,
     /// Shots, all alike but for their priority: 0, 1, 2, and again.
     pub shots: u32,
+    /// How many of the shots, the first ones, are live: somebody waits for each frame.
+    pub live: u32,
     /// The first shot is submitted at once, the others within this time, seconds.
     pub arrive_within_s: f64,
     /// Frames of each shot.
@@ -85,6 +88,7 @@ impl Default for SimConfig {
             workers: 31,
             seed: 1,
             shots: 1,
+            live: 0,
             arrive_within_s: 0.0,
             frames: 600,
             width: 1920,
@@ -149,8 +153,8 @@ pub struct SimReport {
     pub time: TimeShares,
     /// From the first job of a frame to its last pixel.
     pub frame_latency_s: Spread,
-    /// From the moment in which a machine lost power to that in which the scheduler gave
-    /// it up. Those that had nothing to say for themselves until the end are not counted.
+    /// From the moment in which a machine lost power, hung or was cut off to that in which
+    /// the scheduler gave it up. Those that it did not give up are not counted.
     pub notice_s: Spread,
     /// Results of workers that had been given up, all refused.
     pub zombies: u64,

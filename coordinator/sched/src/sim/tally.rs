@@ -42,6 +42,8 @@ pub(crate) struct Tally {
     /// When the first job of each open frame was granted.
     begun: BTreeMap<(ShotId, FrameIndex), u64>,
     latencies_us: Vec<u64>,
+    /// When the scheduler was told of connections.
+    joined: BTreeMap<WorkerId, u64>,
     /// When connections went silent for good.
     silent_since: BTreeMap<WorkerId, u64>,
     notices_us: Vec<u64>,
@@ -94,14 +96,22 @@ impl Tally {
         self.latencies_us.extend(begun_us.filter(|_| is_complete).map(|begun| now_us - begun));
     }
 
+    /// The scheduler is told of a connection.
+    pub(crate) fn joined(&mut self, now_us: u64, worker: WorkerId) {
+        self.joined.insert(worker, now_us);
+    }
+
     /// A connection has gone silent for good, and nobody was told.
     pub(crate) fn silent(&mut self, now_us: u64, worker: WorkerId) {
         self.silent_since.insert(worker, now_us);
     }
 
-    /// The scheduler has given a worker up.
-    pub(crate) fn dropped(&mut self, now_us: u64, worker: WorkerId) {
-        let since_us = self.silent_since(worker);
+    /// The scheduler has given a worker up, which may have been unable to speak since then.
+    pub(crate) fn dropped(&mut self, now_us: u64, worker: WorkerId, mute_us: Option<u64>) {
+        // Some could not speak before anyone knew of them: their first word was held back.
+        let joined_us = self.joined.remove(&worker).unwrap_or_default();
+        let mute_us = mute_us.map(|since| since.max(joined_us));
+        let since_us = self.silent_since(worker).or(mute_us);
         if self.dropped.insert(worker) {
             self.notices_us.extend(since_us.map(|since| now_us - since));
         }

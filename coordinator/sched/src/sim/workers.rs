@@ -10,6 +10,8 @@ use terrafarm_common::id::{LeaseId, WorkerId};
 const JOB_SETUP_US: f64 = 100.0;
 /// Bytes of a message without pixels.
 const SMALL_BYTES: f64 = 100.0;
+/// The coordinator hears of a message that is on its way every so many microseconds.
+const HEARD_EVERY_US: u64 = 50_000;
 /// A machine that went off comes back after at most this time, microseconds.
 const BACK_WITHIN_US: u64 = 10_000_000;
 
@@ -59,8 +61,7 @@ impl World<'_> {
 
     pub(super) fn go_wrong(&mut self, i: usize, fault: Fault) {
         if let Fault::Partition(us) = fault {
-            let machine = &mut self.machines[i];
-            machine.cut_until_us = machine.cut_until_us.max(self.now_us + us);
+            self.machines[i].mute(self.now_us, self.now_us + us, true);
         }
         let Some(worker) = self.machines[i].connection else { return };
         match fault {
@@ -75,7 +76,7 @@ impl World<'_> {
             }
             // The link is cut, whether or not anybody uses it.
             Fault::Partition(_) => {}
-            Fault::Hang(us) => self.machines[i].hangs_until_us = self.now_us + us,
+            Fault::Hang(us) => self.machines[i].mute(self.now_us, self.now_us + us, false),
             Fault::Stuck => self.machines[i].is_stuck = true,
             Fault::Drain => {
                 self.send_up(i, Event::WorkerDraining { worker }, SMALL_BYTES, false);
@@ -206,10 +207,15 @@ impl World<'_> {
         let copies = if is_certain { 1 } else { self.copies() };
         let machine = &mut self.machines[i];
         let Some(sender) = machine.connection else { return };
-        machine.sent_at_us =
-            machine.sent_at_us.max(self.now_us) + (bytes / machine.bytes_per_us) as u64;
-        let at = (machine.sent_at_us + machine.latency_us).max(machine.cut_until_us);
+        let begins = machine.sent_at_us.max(self.now_us);
+        machine.sent_at_us = begins + (bytes / machine.bytes_per_us) as u64;
+        let (latency_us, cut_until_us) = (machine.latency_us, machine.cut_until_us);
+        let at = (machine.sent_at_us + latency_us).max(cut_until_us);
         for _ in 0..copies {
+            let underway = (begins + latency_us..at).step_by(HEARD_EVERY_US as usize).skip(1);
+            for at in underway.filter(|&at| at >= cut_until_us) {
+                self.later(at, Happening::AtHub(sender, Event::HeardFrom { worker: sender }, 0.0));
+            }
             self.later(at, Happening::AtHub(sender, event.clone(), bytes));
         }
     }

@@ -99,7 +99,7 @@ impl<'a> World<'a> {
             scheduler: Scheduler::new(config.scheduler.clone(), seed),
             journal: record.map(begin).transpose()?,
             stopped: None,
-            judge: Judge::default(),
+            judge: Judge::new(&config.scheduler),
             field,
             rng,
             now_us: 0,
@@ -185,6 +185,7 @@ impl<'a> World<'a> {
                     split: self.config.split,
                     priority: (i % 3) as i32,
                     frames_in_flight: self.config.frames_in_flight,
+                    live: i < self.config.live,
                 }),
             );
         }
@@ -235,13 +236,15 @@ impl<'a> World<'a> {
 
     /// Tells the scheduler, and does what it asks for.
     fn tell(&mut self, event: Event) {
-        self.judge.event(&event);
+        self.judge.event(Micros(self.now_us), &event);
         let rendered = match &event {
             Event::JobDone { worker, cost_us, .. } => self.work_us(*worker, *cost_us),
             _ => 0.0,
         };
-        if matches!(event, Event::ShotSubmitted { .. }) {
-            self.tally.shot_open(self.now_us);
+        match event {
+            Event::ShotSubmitted { .. } => self.tally.shot_open(self.now_us),
+            Event::WorkerJoined { worker, .. } => self.tally.joined(self.now_us, worker),
+            _ => {}
         }
         self.events += 1;
         let now = Micros(self.now_us);
@@ -256,7 +259,7 @@ impl<'a> World<'a> {
             self.judge.action(&action);
             self.obey(action, rendered);
         }
-        self.judge.settled();
+        self.judge.settled(now);
     }
 
     /// Does what the scheduler asks for. `rendered` is what the result at hand took, at
@@ -269,7 +272,9 @@ impl<'a> World<'a> {
                 self.send_down(worker, action);
             }
             Action::Drop { worker, .. } => {
-                self.tally.dropped(now_us, worker);
+                let machine = self.connections.get(&worker).map(|&i| &self.machines[i]);
+                let mute_us = machine.and_then(|machine| machine.mute_since(now_us, worker));
+                self.tally.dropped(now_us, worker, mute_us);
                 self.send_down(worker, action);
             }
             Action::Audit { worker, .. }

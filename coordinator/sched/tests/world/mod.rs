@@ -107,6 +107,7 @@ impl World {
             split: Split::Columns,
             priority,
             frames_in_flight: 64,
+            live: false,
         });
     }
 

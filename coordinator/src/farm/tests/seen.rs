@@ -74,8 +74,9 @@ fn frames_of_the_queue_are_seen_by_their_numbers_in_the_flight() {
     bench.join(Peer::Client(CLIENT), 0);
     let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
     let adoption = |numbers: Vec<u32>| {
-        let (shot, cameras) = (ShotId(7), vec![camera; 3]);
-        PeerEvent::Adopt(Box::new(Adoption { shot, submit: submission(3), cameras, numbers }))
+        let (shot, submit, cameras) = (ShotId(7), submission(3), vec![camera; 3]);
+        let (doubts, _) = tokio::sync::mpsc::unbounded_channel();
+        PeerEvent::Adopt(Box::new(Adoption { shot, submit, cameras, numbers, doubts }))
     };
     bench.event(Peer::Client(CLIENT), adoption(vec![117, 140]));
     assert!(look(&mut bench).shots.is_empty(), "a number is missing");

@@ -3,12 +3,12 @@
 use super::{News, SWEEP, Task};
 use crate::queue::ledger::{ShotRecord, Stage};
 use crate::queue::pictures::{self, Unfinished};
-use crate::queue::{OVER_MAX, QueueError, disk};
-use std::time::Instant;
+use crate::queue::{KEY_KEPT, OVER_MAX, QueueError, disk};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::ShotId;
 use tokio_util::sync::CancellationToken;
 
-/// How often pictures of a shot may be found damaged before it is given up.
+/// How often pictures or records of a shot may be found damaged before it is given up.
 const LOSSES_MAX: u32 = 3;
 
 impl Task {
@@ -22,6 +22,7 @@ impl Task {
             outcomes.iter().map(|frame| (frame.shot, frame.index, frame.record.clone())).collect();
         match self.ledger(move |ledger| ledger.record(&frames)).await {
             Ok(progress) => {
+                tracing::debug!(frames = outcomes.len(), "frames recorded");
                 for outcome in outcomes {
                     self.book.count_in_hand(outcome.shot, -1);
                     self.taken(outcome.stay, outcome.frame).await;
@@ -111,8 +112,15 @@ impl Task {
         let (shared, tell) = (self.shared.clone(), self.tell.clone());
         self.errands.spawn(async move {
             let work = tokio::task::spawn_blocking(move || {
-                let frames =
+                let kept =
                     shared.with_ledger(|ledger| ledger.frames(shot)).map_err(Unfinished::Disk)?;
+                let damaged = kept.iter().filter(|(_, frame)| frame.is_none());
+                let damaged: Vec<_> = damaged.map(|(index, _)| *index).collect();
+                if !damaged.is_empty() {
+                    return Err(Unfinished::Lost(damaged));
+                }
+                let whole = kept.into_iter().filter_map(|(index, frame)| Some((index, frame?)));
+                let frames = whole.collect();
                 pictures::finish(&shared.config.folder, &files, &record, &frames, &stop)
             });
             let result = work.await.unwrap_or(Ok("there is no film: its encoder failed".into()));
@@ -140,7 +148,7 @@ impl Task {
                 let losses = self.losses.entry(shot).or_default();
                 *losses += 1;
                 if *losses > LOSSES_MAX {
-                    let why = "its pictures were found damaged on the disk again and again";
+                    let why = "its pictures or their records were found damaged on the disk again and again";
                     return self.fail(shot, why.into()).await;
                 }
                 let count = frames.len();
@@ -151,6 +159,7 @@ impl Task {
                         record.stage = Stage::Open;
                         record.note =
                             format!("{count} pictures were damaged or gone and are rendered again");
+                        record.happened(record.note.clone());
                         self.keep_or_stall(shot, record).await;
                     }
                     Err(why) => self.stall(why).await,
@@ -189,7 +198,7 @@ impl Task {
             self.book.set_refused(shot, None);
         }
         for (shot, hash) in self.book.all_lacking() {
-            if self.shared.blobs.missing(vec![hash]).is_empty() {
+            if self.is_here(hash).await {
                 self.book.set_lacks(shot, None);
                 self.sync_pause(shot).await;
                 self.changed.insert(shot);
@@ -209,6 +218,9 @@ impl Task {
         self.record().await;
         if self.stalled.is_some() {
             return;
+        }
+        for doubted in std::mem::take(&mut self.doubts) {
+            self.doubt(doubted).await;
         }
         for picture in std::mem::take(&mut self.unwritten) {
             self.write(picture);
@@ -239,7 +251,7 @@ impl Task {
         }
     }
 
-    /// Looks through the terrain, when it is time.
+    /// Looks through terrain and keys for what is old, when it is time.
     pub fn sweep(&mut self) {
         let is_due = self.swept.is_none_or(|last| last.elapsed() >= SWEEP);
         if self.is_sweeping || !is_due {
@@ -248,7 +260,13 @@ impl Task {
         (self.is_sweeping, self.swept) = (true, Some(Instant::now()));
         let (shared, tell, terrain) = (self.shared.clone(), self.tell.clone(), self.book.terrain());
         self.errands.spawn(async move {
-            let swept = crate::queue::blocking(move || shared.blobs.sweep(&terrain)).await;
+            let swept = crate::queue::blocking(move || {
+                let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+                let before = now.saturating_sub(KEY_KEPT).as_secs();
+                shared.with_ledger(|ledger| ledger.forget_keys(before))?;
+                shared.blobs.sweep(&terrain)
+            });
+            let swept = swept.await;
             let _ = tell.send(News::Swept(swept)).await;
         });
     }

@@ -44,7 +44,11 @@ impl Task {
             }
             (Stage::Open, _, Some(hash), _) => (
                 ShotState::Stalled,
-                format!("blob {} of its terrain is damaged or gone; send it again", hash.to_hex()),
+                format!(
+                    "blob {} of its terrain is damaged or gone; submit the terrain again, and the shot \
+                     goes on",
+                    hash.to_hex()
+                ),
             ),
             (Stage::Open, _, _, Some(why)) => (ShotState::Waiting, why.clone()),
             (Stage::Open, ..) if stay.is_some_and(|stay| stay.is_accepted) => {
@@ -73,6 +77,7 @@ impl Task {
             // Of a shot that is done, a note says why there is none.
             film: record.stage == Stage::Done && plan.film.is_some() && record.note.is_empty(),
             last_frame: shot.progress.last.map(|index| plan.first_frame + index),
+            history: record.history.clone(),
         })
     }
 }

@@ -1,6 +1,7 @@
 //! A stay of a shot in the farm: in with the frames that are missing, terrain there,
 //! frames back, out.
 
+use super::doubt::Doubted;
 use super::{FrameRecord, News, Outcome, QueueError, Stage, Task};
 use crate::blobs::ClientId;
 use crate::client::unpack;
@@ -9,7 +10,7 @@ use crate::farm::PeerEvent;
 use crate::order::Order;
 use crate::queue::blobs::Blobs;
 use crate::queue::{blocking, pictures};
-use crate::shots::Adoption;
+use crate::shots::{Adoption, Doubt};
 use crate::sink::manifest::{FrameEntry, WorkerEntry};
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -46,7 +47,7 @@ pub struct Stay {
     pub shot: ShotId,
     /// The shot's index of each frame that was submitted, in order; empty while they are
     /// being read.
-    pub frames: Vec<FrameIndex>,
+    pub frames: Arc<[FrameIndex]>,
     /// Whether the farm has taken it.
     pub is_accepted: bool,
     /// Frames that have come or failed.
@@ -59,8 +60,9 @@ pub struct Stay {
 
 /// A finished frame on its way to the disk.
 pub struct Picture {
-    stay: StayId,
-    frame: FrameIndex,
+    pub stay: StayId,
+    /// Its index among the frames of that stay.
+    pub frame: FrameIndex,
     shot: ShotId,
     index: FrameIndex,
     pub entry: FrameEntry,
@@ -83,7 +85,7 @@ impl Task {
         let id = StayId(self.last_stay);
         let stay = Stay {
             shot,
-            frames: Vec::new(),
+            frames: Arc::default(),
             is_accepted: false,
             seen: 0,
             is_done: false,
@@ -92,6 +94,8 @@ impl Task {
         self.stays.insert(id, stay);
         self.by_shot.insert(shot, id);
         self.book.set_present(shot, true);
+        // Nothing of earlier stays is on its way to the disk any more.
+        self.distrusted.retain(|(other, ..)| *other != shot);
         let (shared, tell) = (self.shared.clone(), self.tell.clone());
         self.errands.spawn(async move {
             let read = blocking(move || {
@@ -139,12 +143,14 @@ impl Task {
         let Ok(end) = self.farm.join(id.client(), &name).await else { return };
         let first = state.record.plan.first_frame;
         let in_flight = numbers.iter().map(|index| first + index).collect();
+        let numbers: Arc<[_]> = numbers.into();
         if let Some(stay) = self.stays.get_mut(&id) {
-            stay.frames = numbers;
+            stay.frames = numbers.clone();
         }
-        let (farm, blobs, tell) = (self.farm.clone(), self.shared.blobs.clone(), self.tell.clone());
-        self.errands.spawn(attend(id, end, farm, blobs, tell));
-        let adoption = Box::new(Adoption { shot, submit, cameras, numbers: in_flight });
+        let (doubts, doubted) = mpsc::unbounded_channel();
+        let ear = Ear { id, shot, frames: numbers, end, doubted, tell: self.tell.clone() };
+        self.errands.spawn(attend(ear, self.farm.clone(), self.shared.blobs.clone()));
+        let adoption = Box::new(Adoption { shot, submit, cameras, numbers: in_flight, doubts });
         let _ = self.farm.tell(id.client(), PeerEvent::Adopt(adoption)).await;
         self.sync_pause(shot).await;
     }
@@ -205,6 +211,10 @@ impl Task {
         else {
             return;
         };
+        if self.distrusted.remove(&(shot, id, number)) {
+            self.taken(id, number).await;
+            return self.check_complete(shot).await;
+        }
         let plan = &state.record.plan;
         let (size, samples) = (plan.size, plan.quality.samples_per_side);
         let at = plan.first_frame + index;
@@ -245,6 +255,10 @@ impl Task {
     /// A picture is on the disk, or found no room there.
     pub async fn stored(&mut self, picture: Picture, stored: Result<u64, QueueError>) {
         match stored {
+            Ok(_) if self.distrusted.remove(&(picture.shot, picture.stay, picture.frame)) => {
+                self.drop_in_hand(picture.shot, picture.stay, picture.frame).await;
+                self.check_complete(picture.shot).await;
+            }
             Ok(bytes) => {
                 let Picture { stay, frame, shot, index, entry, .. } = picture;
                 let record = FrameRecord::Done { entry, bytes };
@@ -278,6 +292,14 @@ impl Task {
     /// had again, unless it is here by now.
     pub async fn lacks(&mut self, id: StayId, hash: BlobHash, waits: bool) {
         let Some(shot) = self.stays.get(&id).map(|stay| stay.shot) else { return };
+        let index = self.book.get(shot).map(|state| state.record.plan.index);
+        if let (Some(index), true) = (index, waits) {
+            tracing::warn!(%shot, %hash, "terrain is damaged or gone; the shot waits for it");
+            let blobs = self.shared.blobs.clone();
+            if let Err(why) = blocking(move || blobs.suspect_store(index)).await {
+                tracing::warn!(%shot, "its terrain cannot be looked through: {why}");
+            }
+        }
         self.book.set_lacks(shot, waits.then_some(hash));
         // First its jobs are stopped, else they would fail.
         self.sync_pause(shot).await;
@@ -307,29 +329,62 @@ impl Task {
     }
 }
 
-/// Hears the farm for one stay, and supplies its terrain, until the farm closes the line.
-async fn attend(
+/// What hears the farm for one stay.
+struct Ear {
     id: StayId,
-    mut end: OutboxEnd,
-    farm: FarmLine,
-    blobs: Arc<Blobs>,
+    shot: ShotId,
+    frames: Arc<[FrameIndex]>,
+    end: OutboxEnd,
+    doubted: mpsc::UnboundedReceiver<Doubt>,
     tell: mpsc::Sender<News>,
-) {
-    let (wants, wanted) = mpsc::channel(WANTS);
-    let heard = async {
-        while let Some(message) = end.recv().await {
-            let sent = match message {
-                Message::WantBlobs(want) => wants.send(want).await.is_ok(),
-                Message::Progress(_) | Message::Pong(_) => true,
-                other => tell.send(News::Said(id, Box::new(other))).await.is_ok(),
+}
+
+impl Ear {
+    /// Passes on what the farm says, until it closes the line or the queue has ended.
+    async fn hear(mut self, wants: mpsc::Sender<WantBlobs>) {
+        loop {
+            let heard = tokio::select! {
+                Some(doubt) = self.doubted.recv() => Err(doubt),
+                message = self.end.recv() => match message {
+                    Some(message) => Ok(message),
+                    None => return,
+                },
+            };
+            let sent = match heard {
+                Err(doubt) => self.doubt(doubt).await,
+                Ok(Message::WantBlobs(want)) => wants.send(want).await.is_ok(),
+                Ok(Message::Progress(_) | Message::Pong(_)) => true,
+                Ok(other) => {
+                    // What is doubted was said before: the last word on a shot must not
+                    // overtake it.
+                    let mut sent = true;
+                    while let (Ok(doubt), true) = (self.doubted.try_recv(), sent) {
+                        sent = self.doubt(doubt).await;
+                    }
+                    sent && self.tell.send(News::Said(self.id, Box::new(other))).await.is_ok()
+                }
             };
             if !sent {
-                break;
+                return;
             }
         }
-    };
+    }
+
+    async fn doubt(&self, doubt: Doubt) -> bool {
+        let Doubt { worker, frames } = doubt;
+        let all = frames.into_iter().flat_map(|(first, last)| first..=last);
+        let known = all.filter_map(|frame| Some((frame, *self.frames.get(frame as usize)?)));
+        let doubted = Doubted { stay: self.id, shot: self.shot, worker, frames: known.collect() };
+        self.tell.send(News::Doubted(doubted)).await.is_ok()
+    }
+}
+
+/// Hears the farm for one stay, and supplies its terrain, until the farm closes the line.
+async fn attend(ear: Ear, farm: FarmLine, blobs: Arc<Blobs>) {
+    let (wants, wanted) = mpsc::channel(WANTS);
+    let (id, tell) = (ear.id, ear.tell.clone());
     tokio::select! {
-        () = heard => {}
+        () = ear.hear(wants) => {}
         () = supply(id, wanted, &farm, &blobs, &tell) => {}
     }
     let _ = tell.send(News::Hung(id)).await;

@@ -22,6 +22,7 @@ use terrafarm_terrain::store::StoreReader;
 use terrafarm_wire::Message;
 use terrafarm_wire::message::{Done, Grant, RenderReport, Timesheet, WantBlobs};
 use terrafarm_wire::pixels::Pixels;
+use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 
 /// How long anything may take before a test gives up on it.
@@ -56,8 +57,12 @@ impl House {
     }
 
     pub async fn with(config: QueueConfig) -> Self {
+        Self::with_farm(config, Config::default()).await
+    }
+
+    pub async fn with_farm(config: QueueConfig, farm: Config) -> Self {
         let stop = CancellationToken::new();
-        let line = FarmLine::to_new_farm(Config::default(), stop.clone());
+        let line = FarmLine::to_new_farm(farm, stop.clone());
         let deadline = Instant::now() + PATIENCE;
         let (queue, task) = loop {
             match Queue::open(config.clone(), line.clone()).await {
@@ -95,6 +100,12 @@ impl House {
         tokio::spawn(work(self.line.clone(), worker, jobs, self.log.clone()))
     }
 
+    /// A worker all of whose pixels are wrong; it answers a grant for each permit.
+    pub async fn hire_liar(&self, worker: WorkerId, permits: Arc<Semaphore>) -> JoinHandle<()> {
+        let (line, log) = (self.line.clone(), self.log.clone());
+        tokio::spawn(paint(line, worker, log, permits, 1))
+    }
+
     /// The numbers of the frames that were rendered, in order.
     pub fn rendered(&self) -> Vec<FrameIndex> {
         self.log.lock().unwrap().iter().map(|(_, frame)| *frame).collect()
@@ -119,9 +130,15 @@ impl House {
 /// Renders: asks for the whole terrain of a shot, then answers grants by their camera's
 /// position.
 pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
+    let permits = Arc::new(Semaphore::new(jobs.min(Semaphore::MAX_PERMITS)));
+    paint(line, worker, log, permits, 0).await;
+}
+
+/// As [`work`], a grant for each permit, in another colour.
+async fn paint(line: FarmLine, worker: WorkerId, log: Log, permits: Arc<Semaphore>, fault: u8) {
     let mut end = line.hire(worker).await;
     let (mut wanted, mut waiting) = (Vec::new(), Vec::<Grant>::new());
-    let (mut index_of, mut answered) = (HashMap::new(), 0);
+    let mut index_of = HashMap::new();
     while let Some(message) = end.recv().await {
         match message {
             Message::OpenShot(open) => {
@@ -156,21 +173,18 @@ pub async fn work(line: FarmLine, worker: WorkerId, jobs: usize, log: Log) {
         }
         while wanted.is_empty() && !waiting.is_empty() {
             let grant = waiting.remove(0);
-            if answered >= jobs {
-                std::future::pending::<()>().await;
-            }
-            answered += 1;
+            permits.acquire().await.unwrap().forget();
             let number = grant.camera.position.x as FrameIndex;
             log.lock().unwrap().push((grant.shot, number));
-            if !line.work(worker, done(&grant, number)).await {
+            if !line.work(worker, done(&grant, number, fault)).await {
                 return;
             }
         }
     }
 }
 
-fn done(grant: &Grant, number: FrameIndex) -> Done {
-    let pixels = vec![number as u8; grant.region.area() as usize * 3];
+fn done(grant: &Grant, number: FrameIndex, fault: u8) -> Done {
+    let pixels = vec![number as u8 ^ fault; grant.region.area() as usize * 3];
     let report = RenderReport { cost_us: 10, rays: 1, steps: 1, fallbacks: 0, below_ground: false };
     let pixels = Pixels::raw(Bytes::from(pixels)).unwrap();
     let timesheet = Timesheet::default();

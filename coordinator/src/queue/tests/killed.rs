@@ -28,7 +28,7 @@ fn recorded(folder: &Path) -> BTreeSet<(ShotId, FrameIndex)> {
     let mut all = BTreeSet::new();
     for shot in saved {
         for (index, record) in ledger.frames(shot.id).unwrap() {
-            let FrameRecord::Done { bytes, .. } = record else { panic!("{record:?}") };
+            let Some(FrameRecord::Done { bytes, .. }) = record else { panic!("{record:?}") };
             let path = picture(&shot_folder(folder, shot.id), index);
             assert_eq!(fs::metadata(path).unwrap().len(), bytes, "a record without its picture");
             all.insert((shot.id, index));
@@ -53,9 +53,10 @@ async fn a_film_that_is_being_made_does_not_hold_up_the_end() {
         stage: Stage::Finishing,
         note: String::new(),
         workers: Vec::new(),
+        history: Vec::new(),
     };
     let mut ledger = Ledger::open(&folder.path().join("queue.redb")).unwrap();
-    ledger.add(shot, &record, &[]).unwrap();
+    ledger.add(shot, &record, &[], None).unwrap();
     drop(ledger);
     fs::create_dir_all(shot_folder(folder.path(), shot)).unwrap();
     let house = House::open(folder.path()).await;

@@ -92,11 +92,12 @@ impl Model {
                 plan.priority = priority;
                 let cameras = std::mem::take(&mut plan.cameras);
                 let (frames, stage) = (FRAMES, Stage::Open);
-                let (note, workers) = (String::new(), Vec::new());
-                let record = ShotRecord { plan, frames, submitted_s: 7, stage, note, workers };
+                let (note, workers, history) = (String::new(), Vec::new(), Vec::new());
+                let record =
+                    ShotRecord { plan, frames, submitted_s: 7, stage, note, workers, history };
                 self.last += 1;
                 let id = ShotId(self.last);
-                self.ledger.add(id, &record, &cameras).unwrap();
+                self.ledger.add(id, &record, &cameras, None).unwrap();
                 self.book.add(Saved { id, record, progress: Progress::default() });
                 self.acknowledged.insert(id, (Stage::Open, priority));
             }
@@ -330,8 +331,8 @@ fn what_a_damaged_record_says_of_a_shot_is_counted_without_overflow() {
         let mut plan = plan(&land, 1);
         (plan.size, plan.frames_in_flight) = ([u32::MAX; 2], u32::MAX);
         let (frames, stage) = (u32::MAX, Stage::Open);
-        let (note, workers) = (String::new(), Vec::new());
-        let record = ShotRecord { plan, frames, submitted_s: 7, stage, note, workers };
+        let (note, workers, history) = (String::new(), Vec::new(), Vec::new());
+        let record = ShotRecord { plan, frames, submitted_s: 7, stage, note, workers, history };
         let progress = Progress { done: u32::MAX - 1, failed: 0, last: None };
         Saved { id: ShotId(number), record, progress }
     });

@@ -248,6 +248,7 @@ fn submission(jobs: u64, store: Arc<StoreReader>) -> Submission {
         cameras: vec![camera; frames as usize],
         frames_in_flight: FRAMES_IN_FLIGHT,
         priority: 0,
+        live: false,
     }
 }
 

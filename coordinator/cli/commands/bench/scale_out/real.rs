@@ -242,6 +242,7 @@ fn submission(store: &Arc<StoreReader>, cameras: Vec<Camera>, split: Split) -> S
         cameras,
         frames_in_flight: FRAMES_IN_FLIGHT,
         priority: 0,
+        live: false,
     }
 }
 
