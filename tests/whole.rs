@@ -77,6 +77,11 @@ mod oracles;
 #[path = "whole/namespaces.rs"]
 mod namespaces;
 
+/// Workers that look for their coordinator on such a network.
+#[cfg(target_os = "linux")]
+#[path = "whole/search.rs"]
+mod search;
+
 /// What `deploy/` starts: units, the ssh launcher, manifests.
 #[cfg(unix)]
 #[path = "whole/deploy.rs"]

@@ -10,6 +10,7 @@ mod args;
 mod commands;
 mod farm;
 mod files;
+mod identity;
 mod input;
 mod lan;
 mod notify;

@@ -15,11 +15,11 @@ use bytes::Bytes;
 use std::collections::BTreeMap;
 use terrafarm_common::id::{BlobHash, WorkerId};
 use terrafarm_terrain::store::hash_of;
+use terrafarm_wire::limits::WANT_BLOBS_MAX;
 
-/// Most blobs that may be awaited at once, for all workers together: the tiles of a few
-/// hundred cold workers.
-const AWAITED_MAX: usize = 1 << 16;
-
+/// Most blobs that one worker may await. One that keeps the protocol awaits a few dozen, so
+/// this is refused only to one that asks without end, and never because of others.
+const AWAITED_MAX: usize = WANT_BLOBS_MAX;
 /// Most blobs of which it is remembered who has them, and most workers remembered for each.
 const HELD_MAX: usize = 1 << 16;
 const HOLDERS_MAX: usize = 16;
@@ -51,6 +51,8 @@ pub struct Broker {
     kept_bytes: usize,
     limit_bytes: usize,
     wanted: BTreeMap<BlobHash, Wanted>,
+    /// How many blobs each worker awaits, if it awaits any.
+    awaiting: BTreeMap<WorkerId, usize>,
     /// Who has been given a blob, the first one first, and when it was given last.
     held: BTreeMap<BlobHash, (u64, Vec<WorkerId>)>,
     held_by_age: BTreeMap<u64, BlobHash>,
@@ -82,6 +84,7 @@ impl Broker {
             kept_bytes: 0,
             limit_bytes,
             wanted: BTreeMap::new(),
+            awaiting: BTreeMap::new(),
             held: BTreeMap::new(),
             held_by_age: BTreeMap::new(),
         }
@@ -103,6 +106,13 @@ impl Broker {
         if let Some(bytes) = self.touch(hash) {
             return Some(Order::Deliver { worker, hash, bytes, elsewhere });
         }
+        let waits = self.wanted.get(&hash).is_some_and(|w| w.workers.contains_key(&worker));
+        let awaits = self.awaiting.get(&worker).copied().unwrap_or(0);
+        if !waits && awaits >= AWAITED_MAX {
+            let why = format!("this worker awaits {awaits} blobs already");
+            return Some(Order::Refuse(worker, hash, why));
+        }
+        let mut order = None;
         if let Some(wanted) = self.wanted.get_mut(&hash) {
             wanted.workers.insert(worker, elsewhere);
             // It may come for another shot, whose client has the blob when that one goes.
@@ -111,30 +121,47 @@ impl Broker {
                     wanted.others.push(owner);
                 }
             }
-            return None;
+        } else {
+            let Some((&first, others)) = owners.split_first() else {
+                return Some(Order::Refuse(worker, hash, "no client has this terrain".into()));
+            };
+            let workers = BTreeMap::from([(worker, elsewhere)]);
+            let wanted = Wanted { asked: first, others: others.to_vec(), workers };
+            self.wanted.insert(hash, wanted);
+            order = Some(Order::Ask(first, hash));
         }
-        if self.wanted.len() >= AWAITED_MAX {
-            return Some(Order::Refuse(worker, hash, "too many blobs are awaited".into()));
+        if !waits {
+            self.awaiting.insert(worker, awaits + 1);
         }
-        let Some((&first, others)) = owners.split_first() else {
-            return Some(Order::Refuse(worker, hash, "no client has this terrain".into()));
-        };
-        let workers = BTreeMap::from([(worker, elsewhere)]);
-        let wanted = Wanted { asked: first, others: others.to_vec(), workers };
-        self.wanted.insert(hash, wanted);
-        Some(Order::Ask(first, hash))
+        order
+    }
+
+    /// Takes out those who wait for a blob.
+    fn waiting(&mut self, hash: BlobHash) -> BTreeMap<WorkerId, bool> {
+        let workers = self.wanted.remove(&hash).map(|wanted| wanted.workers).unwrap_or_default();
+        for worker in workers.keys() {
+            if let Some(awaits) = self.awaiting.get_mut(worker) {
+                *awaits -= 1;
+                if *awaits == 0 {
+                    self.awaiting.remove(worker);
+                }
+            }
+        }
+        workers
     }
 
     /// A client sent a blob. The caller has verified that its hash is right. A blob that
     /// nobody waits for (any more) is dropped: a client cannot fill our memory unasked.
     pub fn arrived(&mut self, hash: BlobHash, bytes: Bytes) -> Vec<Order> {
-        let Some(wanted) = self.wanted.remove(&hash) else { return Vec::new() };
+        if !self.wanted.contains_key(&hash) {
+            return Vec::new();
+        }
         self.keep(hash, bytes.clone());
         let deliver = |(worker, elsewhere)| {
             let bytes = bytes.clone();
             Order::Deliver { worker, hash, bytes, elsewhere }
         };
-        wanted.workers.into_iter().map(deliver).collect()
+        self.waiting(hash).into_iter().map(deliver).collect()
     }
 
     /// A client does not have a blob that it was asked for.
@@ -147,12 +174,13 @@ impl Broker {
             wanted.asked = next;
             return vec![Order::Ask(next, hash)];
         }
-        let workers = self.wanted.remove(&hash).map(|wanted| wanted.workers).unwrap_or_default();
+        let workers = self.waiting(hash);
         workers.into_keys().map(|worker| Order::Refuse(worker, hash, why.to_owned())).collect()
     }
 
     /// A worker is gone: nobody delivers to it any more.
     pub fn worker_gone(&mut self, worker: WorkerId) {
+        self.awaiting.remove(&worker);
         self.wanted.retain(|_, wanted| {
             wanted.workers.remove(&worker);
             !wanted.workers.is_empty()
@@ -372,6 +400,31 @@ mod tests {
         assert!(broker.holders(hash(1)).is_empty(), "the oldest goes");
         (0..100).for_each(|worker| broker.given(WorkerId(worker), hash(5)));
         assert_eq!(broker.holders(hash(5)).len(), HOLDERS_MAX);
+    }
+
+    #[test]
+    fn a_worker_that_asks_without_end_is_refused_and_others_are_not() {
+        let mut broker = Broker::new(1000);
+        let many = |n: usize| BlobHash(std::array::from_fn(|at| n.to_le_bytes()[at % 8]));
+        let mut want =
+            |worker: u64, n: usize| broker.wanted(WorkerId(worker), many(n), true, &[OWNER]);
+        let workers = 100;
+        for n in 0..AWAITED_MAX * workers {
+            let order = want((n / AWAITED_MAX) as u64, n);
+            assert_eq!(order, Some(Order::Ask(OWNER, many(n))), "{n}");
+        }
+        assert!(matches!(want(0, 0x7f_0000), Some(Order::Refuse(WorkerId(0), ..))));
+        assert_eq!(want(0, 5), None, "it waits for this one already");
+        broker.arrived(many(5), blob(10));
+        broker.missing(OWNER, many(6), "no");
+        for n in [0x7f_0000, 0x7f_0001] {
+            let order = broker.wanted(WorkerId(0), many(n), true, &[OWNER]);
+            assert!(matches!(order, Some(Order::Ask(..))), "there is room again: {order:?}");
+        }
+        for worker in 0..workers as u64 {
+            broker.worker_gone(WorkerId(worker));
+        }
+        assert!(broker.wanted.is_empty() && broker.awaiting.is_empty());
     }
 
     proptest! {

@@ -281,7 +281,7 @@ impl FarmLine {
     /// If the coordinator is stopping.
     pub async fn join(&self, client: ClientId, name: &str) -> Result<OutboxEnd, OrderError> {
         let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
-        let greeting = Greeting { name: name.to_owned(), threads: 0, address: None };
+        let greeting = Greeting { name: name.to_owned(), threads: 0, identity: 0, address: None };
         let traits = peer::PeerTraits { greeting, loopback: true };
         let open = ToDriver::Open(Peer::Client(client), outbox, CancellationToken::new(), traits);
         self.events.send(open).await.map_err(|_| OrderError::Stopping)?;
@@ -483,7 +483,8 @@ impl FarmLine {
     /// A worker inside this process; what the farm says to it comes out of the end.
     pub async fn hire(&self, worker: WorkerId) -> OutboxEnd {
         let (outbox, end) = link::outbox(INSIDE_QUEUE, INSIDE_QUEUE);
-        let greeting = Greeting { name: format!("{worker}"), threads: 2, address: None };
+        let greeting =
+            Greeting { name: format!("{worker}"), threads: 2, identity: 0, address: None };
         let traits = peer::PeerTraits { greeting, loopback: true };
         let open = ToDriver::Open(Peer::Worker(worker), outbox, CancellationToken::new(), traits);
         let _ = self.events.send(open).await;

@@ -61,6 +61,8 @@ pub struct Greeting {
     pub name: String,
     /// Render threads; 0 for a client.
     pub threads: u32,
+    /// A number of a worker's PC; 0 if it gave none.
+    pub identity: u128,
     /// Where it connects from; `None` inside this process.
     pub address: Option<IpAddr>,
 }

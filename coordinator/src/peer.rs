@@ -131,9 +131,9 @@ pub async fn serve(
             return;
         }
     };
-    let (is_worker, threads) = match hello.role {
-        Role::Worker { threads, .. } => (true, threads),
-        Role::Client | Role::Peer => (false, 0),
+    let (is_worker, threads, identity) = match hello.role {
+        Role::Worker { threads, identity, .. } => (true, threads, identity),
+        Role::Client | Role::Peer => (false, 0, 0),
         Role::Desk => {
             desk(connection, &admission).await;
             return drop(place);
@@ -146,7 +146,7 @@ pub async fn serve(
     let hang_up = CancellationToken::new();
     let writing = tokio::spawn(writer.run(queues));
     let traits = PeerTraits {
-        greeting: Greeting { name: hello.name, threads, address: Some(address.ip()) },
+        greeting: Greeting { name: hello.name, threads, identity, address: Some(address.ip()) },
         loopback: link::is_this_pc(address.ip()),
     };
     if admission.events.send(ToDriver::Open(peer, outbox, hang_up.clone(), traits)).await.is_err() {

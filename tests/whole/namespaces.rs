@@ -1,6 +1,6 @@
 //! A farm of several PCs within one: network namespaces joined by a bridge, a link for each.
-//! Links go down and come up, workers give terrain to each other, and find their coordinator
-//! by multicast. Needs Linux, root, and the programs `ip` and `tc`; says so and skips
+//! Links go down and come up, and workers give terrain to each other; how they find their
+//! coordinator is in `search`. Needs Linux, root, and the programs `ip` and `tc`; says so and skips
 //! without them, unless `TERRAFARM_REQUIRE_ORACLES` is set.
 //!
 //! With `TERRAFARM_LONG` set, the long cut lasts 30 s instead of 8 s.
@@ -18,7 +18,7 @@ const PORT: u16 = 7070;
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// Whether networks can be made here; says so if not.
-fn available() -> bool {
+pub fn available() -> bool {
     let user = Command::new("id").arg("-u").output().unwrap();
     if user.stdout != b"0\n" {
         println!("skipped: network namespaces need root");
@@ -73,14 +73,14 @@ fn ip(arguments: &str) -> Result<(), String> {
 
 /// PCs on a switch. Goes away with the test, after those that run there, and also where it
 /// fails; what a killed run left is taken away by the next.
-struct Office {
+pub struct Office {
     /// See [`next_name`]; at most 12 bytes, since names of links have at most 15.
     name: String,
     pcs: usize,
 }
 
 impl Office {
-    fn new(pcs: usize) -> Self {
+    pub fn new(pcs: usize) -> Self {
         sweep();
         let mut office = Office { name: next_name(), pcs: 0 };
         // The switch has no address: nothing else on this PC is part of the network.
@@ -128,7 +128,7 @@ impl Office {
     }
 
     /// A command as it runs on a PC: in its place, with what it was given.
-    fn on(&self, pc: usize, command: &Command) -> Command {
+    pub fn on(&self, pc: usize, command: &Command) -> Command {
         let mut there = Command::new("ip");
         there.args(["netns", "exec", &self.space(pc)]).arg(command.get_program());
         there.args(command.get_args()).stdin(std::process::Stdio::null());
@@ -152,7 +152,8 @@ impl Drop for Office {
     }
 }
 
-fn address(pc: usize) -> String {
+/// The address of a PC.
+pub fn address(pc: usize) -> String {
     format!("10.78.0.{}", pc + 1)
 }
 
@@ -267,15 +268,18 @@ fn a_worker_whose_link_is_cut_is_missed_in_6_seconds_and_comes_back_by_itself() 
     assert!(joined.contains("pc-1"), "{joined}");
     assert!(!output.join("manifest.json").exists(), "all of it happened in mid-shot");
     one.expect("job begins");
+    let working = since.elapsed();
     let (code, lines) = render.finish();
     assert_eq!(code, Some(0), "{lines:#?}");
     assert_eq!(frame_hashes(&output.join("manifest.json")), calm);
     println!(
         "cut for {cut:?}: missed after {noticed:?}, the worker knew after {noticed_there:?}, \
-         back {back:?} after the link"
+         back {back:?} after the link, with its first job after {working:?}"
     );
     let limit = SILENCE + Duration::from_secs(1);
     assert!(noticed >= SILENCE - Duration::from_secs(1) && noticed <= limit, "{noticed:?}");
+    // Two seconds to its next attempt, two for one that began too early, and what a busy PC takes.
+    assert!(working <= Duration::from_secs(5), "{working:?}");
 }
 
 /// The connection outlives the cut, and so does what was sent into it.
@@ -344,38 +348,6 @@ fn workers_on_other_pcs_give_terrain_to_each_other_with_the_token() {
     println!("received by each: {received_alone:?} alone, {received_shared:?} shared");
     assert_eq!((&alone, &shared), (&calm, &calm));
     assert!(sent_shared * 3 < sent_alone * 2, "{sent_shared} of {sent_alone} bytes");
-}
-
-#[test]
-fn a_worker_has_its_first_job_in_a_second_and_finds_its_coordinator_by_itself() {
-    if !available() {
-        return;
-    }
-    let world = World::new(300);
-    let mut farm = Farm::new(&world.dir, "farm", 2, &[]);
-    let output = world.dir.path("farm-frames");
-    // More than is rendered before the test ends.
-    let settings = ["--size", "1280x720", "--fps", "500", "--samples", "4"];
-    let _render = Running::start(&mut farm.render(&world, &settings, &output));
-    farm.coordinator.expect("shot submitted");
-    let first_job = |start: &dyn Fn() -> Running| {
-        let mut times: Vec<_> = (0..3)
-            .map(|_| {
-                let since = Instant::now();
-                let mut worker = start();
-                worker.expect("job begins");
-                since.elapsed()
-            })
-            .collect();
-        times.sort();
-        times
-    };
-    let told = first_job(&|| farm.worker(1, &["--cache-limit", "0"]));
-    let searched = first_job(&|| farm.worker_that_searches(2, &["--cache-limit", "0"]));
-    println!("first job after {told:?} if told where, {searched:?} by multicast");
-    // The promise is a second; a PC that does other work meanwhile gets half of one more.
-    assert!(told[1] <= Duration::from_millis(1500), "{told:?}");
-    assert!(searched[1] <= Duration::from_secs(10), "{searched:?}");
 }
 
 /// Namespaces and links of a bench, by the number of its process.

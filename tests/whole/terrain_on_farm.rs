@@ -135,3 +135,95 @@ fn tiles_that_were_damaged_on_disk_are_fetched_again() {
     }
     assert_eq!(results[0], results[1]);
 }
+
+/// Renders with one worker whose cache stops taking anything once it is connected; every line
+/// that the worker said.
+fn render_without_disk(
+    world: &World,
+    name: &str,
+    cache: &Path,
+    break_disk: impl Fn(),
+) -> Vec<String> {
+    let (mut coordinator, address) = coordinator();
+    let mut worker = worker(&address, "pc-1", cache, &["--once"]);
+    worker.expect("connected");
+    break_disk();
+    let output = world.dir.path(name);
+    succeed(world.render().args(SIZE).args(["--coordinator", &address, "-o"]).arg(&output));
+    let calm = world.dir.path("calm");
+    if !calm.exists() {
+        succeed(world.render().args(SIZE).args(["--workers", "1", "-o"]).arg(&calm));
+    }
+    let hashes = [&output, &calm].map(|folder| frame_hashes(&folder.join("manifest.json")));
+    assert_eq!(hashes[0], hashes[1]);
+    coordinator.kill();
+    worker.finish().1
+}
+
+#[test]
+fn a_disk_that_takes_nothing_costs_one_warning_and_no_frame() {
+    let world = World::new(1500);
+    let warnings =
+        |lines: &[String]| lines.iter().filter(|l| l.contains("terrain is not kept")).count();
+    let cache = world.dir.path("cache");
+    let lines = render_without_disk(&world, "gone", &cache, || {
+        std::fs::remove_dir_all(&cache).unwrap();
+        std::fs::write(&cache, "no folder").unwrap();
+    });
+    assert_eq!(warnings(&lines), 1, "{lines:#?}");
+    let unkept = lines.iter().filter(|line| line.contains("a terrain blob was not kept"));
+    assert!(unkept.count() > 3, "there was more than one blob");
+}
+
+/// A file system that goes away with the test.
+#[cfg(target_os = "linux")]
+struct Mounted(std::path::PathBuf);
+
+#[cfg(target_os = "linux")]
+impl Mounted {
+    /// One in memory, of so many bytes; `None` where this user may make none.
+    fn new(folder: &Path, options: &str) -> Option<Self> {
+        std::fs::create_dir(folder).unwrap();
+        let mut mount = std::process::Command::new("mount");
+        let done = mount.args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(folder).output();
+        done.is_ok_and(|done| done.status.success()).then(|| Mounted(folder.to_owned()))
+    }
+
+    fn is_read_only_from_now_on(&self) {
+        let mut mount = std::process::Command::new("mount");
+        succeed(mount.args(["-o", "remount,ro"]).arg(&self.0));
+    }
+}
+
+#[cfg(target_os = "linux")]
+impl Drop for Mounted {
+    fn drop(&mut self) {
+        let _ = std::process::Command::new("umount").arg("--lazy").arg(&self.0).output();
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_and_one_that_may_not_be_written_cost_one_warning_and_no_frame() {
+    let world = World::new(1500);
+    for (name, options) in [("full", "size=64k"), ("read-only", "size=64m")] {
+        let cache = world.dir.path(&format!("{name}-cache"));
+        let Some(disk) = Mounted::new(&cache, options) else {
+            println!("skipped: only root mounts disks");
+            return;
+        };
+        let lines = render_without_disk(&world, name, &cache, || {
+            if name == "read-only" {
+                disk.is_read_only_from_now_on();
+            }
+        });
+        let said = lines.iter().filter(|line| line.contains("terrain is not kept"));
+        let said: Vec<_> = said.collect();
+        assert!(
+            matches!(said[..], [line] if line.contains("is there space")),
+            "{name}: {lines:#?}"
+        );
+        let left = std::fs::read_dir(&cache).unwrap().count();
+        println!("{name}: {left} files are there");
+    }
+}

@@ -23,7 +23,7 @@ use terrafarm_wire::Message;
 use terrafarm_wire::link::{Trust, accept, outbox};
 use terrafarm_wire::message::{Ahead, Blob, Grant, OpenShot, Timesheet};
 use terrafarm_worker::office::Rules;
-use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig, run};
+use terrafarm_worker::{Reconnect, ShareTiles, Whereabouts, WorkerConfig, run};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
@@ -91,7 +91,7 @@ async fn fly(
     let config = WorkerConfig {
         rules: Rules::default(),
         bandwidth_bytes_per_s: None,
-        coordinator: listener.local_addr().expect("an address").to_string(),
+        coordinator: Whereabouts::At(listener.local_addr().expect("an address").to_string()),
         trust: Trust::Loopback,
         name: "cold".to_owned(),
         threads: 1,
@@ -101,6 +101,7 @@ async fn fly(
         share: ShareTiles::Never,
         reconnect: Reconnect::NEVER,
         seed: 1,
+        identity: 0,
     };
     let worker = tokio::spawn(run(config, std::future::pending()));
     let (stream, _) = listener.accept().await.expect("a worker");

@@ -4,8 +4,8 @@
 //! what happens, purely; [`render`] spreads a job over the cores; [`terrain`] holds
 //! decoded tiles within a memory limit; `shift` is the thin shell that carries out what
 //! the session asks for over one connection; [`office`] says when and with how many threads
-//! a worker on somebody's PC works; `share` passes terrain from worker to worker; `backoff`
-//! says when to try again, `clock` where the time goes, `trial` how fast this PC is. A [`sleeper`]
+//! a worker on somebody's PC works; `share` passes terrain from worker to worker; `dial`
+//! connects, [`search`] finds whom to connect to; `backoff` says when to try again, `clock` where the time goes, `trial` how fast this PC is. A [`sleeper`]
 //! stands in for a worker where a coordinator is measured.
 //!
 //! The worker owns nothing that cannot be had again: whatever breaks, the coordinator
@@ -15,8 +15,10 @@
 
 mod backoff;
 mod clock;
+mod dial;
 pub mod office;
 pub mod render;
+pub mod search;
 pub mod session;
 mod share;
 mod shift;
@@ -25,9 +27,11 @@ pub mod terrain;
 mod trial;
 
 pub use backoff::Reconnect;
+pub use dial::Whereabouts;
 pub use render::{Caster, RayCaster};
 
 use backoff::Backoff;
+use dial::{Dial, NoLink};
 use office::{Gate, Rules, Watch};
 use share::{Others, Shelf};
 use shift::{Shift, Site};
@@ -35,23 +39,16 @@ use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
 use terrafarm_terrain::cache::BlobCache;
-use terrafarm_wire::link::{Connection, HandshakeError, Paced, Trust, greet, is_this_pc};
-use terrafarm_wire::message::{Hello, Role, Welcome};
-use tokio::net::TcpStream;
-use tokio::time::timeout;
+use terrafarm_wire::link::{HandshakeError, Trust, is_this_pc};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
-
-/// How long connecting may take, and the greeting after it.
-const CONNECT_LIMIT: Duration = Duration::from_secs(10);
 
 /// What a worker needs to know.
 #[derive(Debug, Clone)]
 pub struct WorkerConfig {
-    /// Address of the coordinator, `host:port`.
-    pub coordinator: String,
+    /// Where the coordinator is.
+    pub coordinator: Whereabouts,
     /// How it and the coordinator know each other.
     pub trust: Trust,
     /// What to call this worker; a host name, usually.
@@ -78,6 +75,9 @@ pub struct WorkerConfig {
     /// A number of this process: the worker's incarnation and the seed of its back-off.
     /// Two workers should have different ones.
     pub seed: u64,
+    /// A number of this PC that outlives the process; 0 if there is none. A coordinator that
+    /// has found wrong pixels knows the PC by it.
+    pub identity: u128,
 }
 
 /// Whether a worker gives its tiles to others of its farm, which spares the coordinator's
@@ -116,6 +116,9 @@ pub enum WorkerError {
         /// What the system or the peer said last.
         why: String,
     },
+    /// No coordinator was found that lets this worker in, and [`Reconnect`] says to give up.
+    #[error("{0}; name one with --coordinator HOST:PORT")]
+    Nobody(String),
     /// The coordinator does not want this worker; trying again cannot help.
     #[error("coordinator {address} refuses this worker: {text}")]
     Refused {
@@ -176,18 +179,23 @@ async fn work<C: Caster>(
     let mut site = site(&config, caster).await?;
     let mut backoff = Backoff::new(config.reconnect, config.seed);
     let mut watch = Watch::begin(&config.rules, config.threads, &site.gate);
+    let mut dial = Dial::new(&config.coordinator);
     let mut welcomed = false;
+    let mut said = None;
     loop {
         tokio::select! {
             () = watch.on_duty() => {}
             () = stop.cancelled() => return Ok(Ended::Stopped),
         }
-        let why = match connect(&config, &stop).await {
-            Ok(None) => return Ok(Ended::Stopped),
-            Ok(Some((connection, welcome, [own, peer]))) => {
+        let connected = tokio::select! {
+            connected = dial.connect(&config) => connected,
+            () = stop.cancelled() => return Ok(Ended::Stopped),
+        };
+        let why = match connected {
+            Ok((connection, welcome, [own, peer])) => {
                 info!(coordinator = welcome.coordinator, peer = %peer, "connected");
                 backoff.reset();
-                welcomed = true;
+                (welcomed, said) = (true, None);
                 share(&config, &mut site, own, peer).await;
                 let shift = Shift::new(&mut site, !is_this_pc(peer.ip()), &welcome);
                 let leave = stop.child_token();
@@ -198,34 +206,52 @@ async fn work<C: Caster>(
                         continue;
                     }
                     Ok(()) => return Ok(Ended::Drained),
-                    Err(lost) => lost.to_string(),
+                    Err(lost) => NoLink::There(lost.into()),
                 }
             }
-            Err(HandshakeError::Refused { refusal, text }) if !refusal.is_temporary() => {
-                let address = config.coordinator;
-                return Err(WorkerError::Refused { address, text });
-            }
-            // Anyone on the way can say this: a token that was right once is right.
-            Err(why @ HandshakeError::TurnedAway(refusal))
-                if !welcomed && !refusal.is_temporary() =>
-            {
-                let (address, text) = (config.coordinator, why.to_string());
-                return Err(WorkerError::Refused { address, text });
-            }
-            Err(why @ HandshakeError::NoToken) => {
-                return Err(WorkerError::NoToken { address: config.coordinator, why });
-            }
-            Err(error) => error.to_string(),
+            Err(why) => why,
         };
+        let why = hopeful(why, &config.coordinator, welcomed)?;
         let Some(pause) = backoff.next() else {
-            let address = config.coordinator;
-            return Err(WorkerError::Unreachable { address, why });
+            return Err(match &config.coordinator {
+                Whereabouts::At(address) => {
+                    WorkerError::Unreachable { address: address.clone(), why }
+                }
+                Whereabouts::Sought(_) => WorkerError::Nobody(why),
+            });
         };
-        warn!(why, retry_in_ms = pause.as_millis() as u64, "no connection to the coordinator");
+        let retry_in_ms = pause.as_millis() as u64;
+        // A night without a coordinator is worth a line, not a thousand.
+        if said.as_ref() == Some(&why) {
+            debug!(why, retry_in_ms, "still no connection to the coordinator");
+        } else {
+            warn!(why, retry_in_ms, "no connection to the coordinator");
+            said = Some(why);
+        }
         tokio::select! {
             () = tokio::time::sleep(pause) => {}
             () = stop.cancelled() => return Ok(Ended::Stopped),
         }
+    }
+}
+
+/// Why there is no connection, in words; an error if trying again cannot help. Where a
+/// coordinator is looked for, it always can.
+fn hopeful(why: NoLink, coordinator: &Whereabouts, welcomed: bool) -> Result<String, WorkerError> {
+    let (why, address) = match (why, coordinator) {
+        (NoLink::There(why), Whereabouts::At(address)) => (why, address.clone()),
+        (why, _) => return Ok(why.to_string()),
+    };
+    match why {
+        HandshakeError::Refused { refusal, text } if !refusal.is_temporary() => {
+            Err(WorkerError::Refused { address, text })
+        }
+        // Anyone on the way can say this: a token that was right once is right.
+        why @ HandshakeError::TurnedAway(refusal) if !welcomed && !refusal.is_temporary() => {
+            Err(WorkerError::Refused { address, text: why.to_string() })
+        }
+        why @ HandshakeError::NoToken => Err(WorkerError::NoToken { address, why }),
+        why => Ok(why.to_string()),
     }
 }
 
@@ -268,6 +294,7 @@ async fn site<C: Caster>(config: &WorkerConfig, caster: C) -> Result<Site<C>, Wo
     Ok(Site {
         pool,
         cache,
+        cache_failed: Arc::default(),
         terrain,
         caster,
         gate,
@@ -307,37 +334,5 @@ async fn share<C: Caster>(
             site.shelf = Some(shelf);
         }
         Err(error) => warn!(%address, %error, "cannot give terrain to other workers"),
-    }
-}
-
-/// A connection, what the coordinator said, and the addresses of both ends, ours first.
-type Connected = (Connection<Paced<TcpStream>>, Welcome, [SocketAddr; 2]);
-
-/// A greeted connection; `None` if the worker is told to stop meanwhile.
-async fn connect(
-    config: &WorkerConfig,
-    stop: &CancellationToken,
-) -> Result<Option<Connected>, HandshakeError> {
-    let attempt = async {
-        let connecting = timeout(CONNECT_LIMIT, TcpStream::connect(&config.coordinator));
-        let stream = connecting.await.map_err(|_| HandshakeError::TimedOut(CONNECT_LIMIT))?;
-        let stream = stream.map_err(terrafarm_wire::link::LinkError::Io)?;
-        let peer = stream.peer_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
-        let own = stream.local_addr().map_err(terrafarm_wire::link::LinkError::Io)?;
-        // Small messages must not wait for others to fill a packet.
-        if let Err(error) = stream.set_nodelay(true) {
-            warn!(%error, "the connection stays slow for small messages");
-        }
-        let threads = config.threads.max(1) as u32;
-        let role = Role::Worker { threads, incarnation: config.seed };
-        let hello = Hello::new(&config.name, role);
-        let token = config.trust.token_for(peer.ip())?;
-        let stream = Paced::new(stream, config.bandwidth_bytes_per_s);
-        let (connection, welcome) = greet(stream, token, hello, CONNECT_LIMIT).await?;
-        Ok((connection, welcome, [own, peer]))
-    };
-    tokio::select! {
-        connected = attempt => connected.map(Some),
-        () = stop.cancelled() => Ok(None),
     }
 }

@@ -49,6 +49,8 @@ const REPORTS_MAX: usize = 64;
 pub(crate) struct Site<C: Caster> {
     pub pool: ThreadPool,
     pub cache: Option<Arc<BlobCache>>,
+    /// Whether it has failed to keep a blob.
+    pub cache_failed: Arc<AtomicBool>,
     pub terrain: Terrain<C::Prepared>,
     pub caster: Arc<C>,
     pub gate: Gate,
@@ -319,7 +321,7 @@ impl<'a, C: Caster> Shift<'a, C> {
     fn take(&mut self, blob: Blob) -> Option<Event> {
         let Blob { hash, bytes } = blob;
         let (caster, unpacking_ns) = (self.site.caster.clone(), self.unpacking_ns.clone());
-        let cache = self.site.cache.clone();
+        let (cache, failed) = (self.site.cache.clone(), self.site.cache_failed.clone());
         self.spawn(
             move || {
                 counted(&unpacking_ns, || {
@@ -328,7 +330,7 @@ impl<'a, C: Caster> Shift<'a, C> {
                     }
                     let report = decoded(&*caster, hash, &bytes);
                     if !matches!(report, Report::Spoiled(..)) {
-                        keep(cache.as_deref(), &hash, &bytes);
+                        keep(cache.as_deref(), &failed, &hash, &bytes);
                     }
                     report
                 })
@@ -528,10 +530,15 @@ fn read(cache: &BlobCache, hash: &BlobHash) -> Option<Vec<u8>> {
     found
 }
 
-/// Keeps a blob on disk, if there is a cache.
-fn keep(cache: Option<&BlobCache>, hash: &BlobHash, bytes: &[u8]) {
+/// Keeps a blob on disk, if there is a cache. A disk that has `failed` once is not spoken of
+/// again: one that is full for a night, and takes a small tile now and then, is worth a line.
+fn keep(cache: Option<&BlobCache>, failed: &AtomicBool, hash: &BlobHash, bytes: &[u8]) {
     if let Some(Err(error)) = cache.map(|cache| cache.put(hash, bytes)) {
-        warn!(%error, "a terrain blob was not kept");
+        if failed.swap(true, Ordering::Relaxed) {
+            debug!(%error, "a terrain blob was not kept");
+        } else {
+            warn!(%error, "terrain is not kept on disk, and fetched anew when it is needed again");
+        }
     }
 }
 

@@ -6,7 +6,7 @@
 //! sleeper keeps time: how long it had a job in hand, and how long it waited from each
 //! result to the next job.
 
-use crate::CONNECT_LIMIT;
+use crate::dial::CONNECT_LIMIT;
 use bytes::Bytes;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -76,7 +76,7 @@ impl Sleeper {
         let stream = connecting.await.map_err(|_| HandshakeError::TimedOut(CONNECT_LIMIT))?;
         let stream = stream.map_err(LinkError::Io)?;
         stream.set_nodelay(true).map_err(LinkError::Io)?;
-        let hello = Hello::new(name, Role::Worker { threads: 1, incarnation });
+        let hello = Hello::new(name, Role::Worker { threads: 1, incarnation, identity: 0 });
         let (connection, _welcome) = greet(stream, None, hello, CONNECT_LIMIT).await?;
         Ok(Sleeper { connection, job })
     }

@@ -18,7 +18,7 @@ mod token;
 mod trust;
 
 pub use channel::ChannelError;
-pub use handshake::{Greeting, HandshakeError, accept, greet, program};
+pub use handshake::{Greeting, HandshakeError, Proved, accept, greet, program, prove};
 pub use outbox::{Meter, Outbox, OutboxEnd, Unsent, metered, outbox};
 pub use pace::Paced;
 pub use token::{FarmToken, NoRandomness, TOKEN_BYTES, TokenError};

@@ -1,27 +1,26 @@
 //! `terrafarm coordinator` and `terrafarm worker`: the two services.
 
 use crate::secret::{self, Source};
-use crate::{Outcome, args, files, lan, notify};
+use crate::{Outcome, args, files, identity, lan, notify};
 use anyhow::{Context, bail};
 use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::api::{Access, Web, WebKey};
 use terrafarm_coordinator::queue::QueueConfig;
 use terrafarm_coordinator::{Config, Coordinator};
 use terrafarm_wire::link::{Trust, is_this_pc};
 use terrafarm_worker::office::Rules;
-use terrafarm_worker::{Reconnect, ShareTiles, WorkerConfig};
-use tokio::net::{TcpListener, TcpStream};
+use terrafarm_worker::{Reconnect, ShareTiles, Whereabouts, WorkerConfig};
+use tokio::net::TcpListener;
 
 const MIB: u64 = 1 << 20;
 /// Open files that are enough for a thousand workers, and the queue.
 const FILES_ENOUGH: u64 = 1200;
 /// How long threads that wait for a disk may take when the coordinator stops.
 const FAREWELL: Duration = Duration::from_secs(2);
-/// How long the network is listened to before this PC is looked at again.
-const SEARCH: Duration = Duration::from_secs(3);
 /// Where the page is, unless told otherwise.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7071);
 
@@ -194,12 +193,18 @@ fn quoted(path: &str) -> String {
 /// Works until Ctrl-C or SIGTERM, or with `--once` until the coordinator goes away.
 pub fn worker(args: args::serve::Worker) -> anyhow::Result<Outcome> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
-    let mut config = WorkerConfig {
+    let cache_dir =
+        (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir));
+    let config = WorkerConfig {
         trust: secret::to_connect(&args.security)?,
-        coordinator: args.coordinator.clone().unwrap_or_default(),
+        coordinator: match &args.coordinator {
+            Some(address) => Whereabouts::At(address.clone()),
+            None => Whereabouts::Sought(Arc::new(lan::Lan)),
+        },
         name: args.name.unwrap_or_else(pc_name),
         threads: args.threads.unwrap_or(cores) as usize,
-        cache_dir: (args.cache_limit > 0).then(|| args.cache_dir.unwrap_or_else(default_cache_dir)),
+        identity: cache_dir.as_deref().map_or(0, |folder| identity::of_this_pc(folder, &pc_name())),
+        cache_dir,
         cache_limit_bytes: args.cache_limit * MIB,
         memory_limit_bytes: args.memory_limit * MIB,
         share: match args.share_port {
@@ -212,45 +217,17 @@ pub fn worker(args: args::serve::Worker) -> anyhow::Result<Outcome> {
         reconnect: if args.once { Reconnect::NEVER } else { Reconnect::default() },
         seed: process_seed(),
     };
+    let status = match &args.coordinator {
+        Some(address) => format!("working for {address}"),
+        None => "looking for a coordinator".to_owned(),
+    };
     runtime()?.block_on(async {
         let stop = stop_signal();
-        let mut stop = std::pin::pin!(told(stop));
         // A coordinator that is not there yet is waited for, so the service is up already.
-        if args.coordinator.is_none() {
-            notify::ready("looking for a coordinator");
-            config.coordinator = tokio::select! {
-                found = whom_to_work_for(args.once) => found?,
-                () = &mut stop => return Ok(Outcome::Done),
-            };
-        }
-        notify::ready(&format!("working for {}", config.coordinator));
-        terrafarm_worker::run(config, stop).await?;
+        notify::ready(&status);
+        terrafarm_worker::run(config, told(stop)).await?;
         Ok(Outcome::Done)
     })
-}
-
-/// The coordinator on this PC, or the one on this network.
-async fn whom_to_work_for(only_once: bool) -> anyhow::Result<String> {
-    let mut told = false;
-    loop {
-        if TcpStream::connect(args::COORDINATOR).await.is_ok() {
-            return Ok(args::COORDINATOR.to_owned());
-        }
-        let looking = tokio::task::spawn_blocking(|| lan::find(SEARCH));
-        if let Some(address) = looking.await.context("looking for a coordinator failed")?? {
-            println!("found a coordinator at {address}");
-            return Ok(address.to_string());
-        }
-        if only_once {
-            bail!(
-                "no coordinator on this PC, and none answers on this network; name one with \
-                 --coordinator HOST:PORT"
-            );
-        }
-        if !std::mem::replace(&mut told, true) {
-            println!("waiting for a coordinator; name one with --coordinator HOST:PORT");
-        }
-    }
 }
 
 /// The async runtime of a service: its threads move bytes, they never render.

@@ -158,7 +158,7 @@ impl Farm {
                 terrain,
                 blocked: tally
                     .map_or_else(Vec::new, |tally| tally.blocked.iter().copied().collect()),
-                distrusted: self.trust.is_distrusted(&state.greeting.name),
+                distrusted: self.scheduler.is_distrusted(id),
                 cache: status.map(|status| CacheView {
                     memory_bytes: status.memory_bytes,
                     memory_limit_bytes: status.memory_limit_bytes,

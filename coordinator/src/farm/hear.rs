@@ -16,7 +16,7 @@ impl Farm {
             PeerEvent::Joined(greeting) => {
                 tracing::info!(%worker, name = %greeting.name, threads = greeting.threads, "worker joined");
                 let threads = greeting.threads;
-                let is_distrusted = self.trust.is_distrusted(&greeting.name);
+                let is_distrusted = self.trust.is_distrusted(&greeting);
                 let state = WorkerState {
                     greeting,
                     opened: BTreeSet::new(),

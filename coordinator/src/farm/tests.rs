@@ -26,6 +26,14 @@ struct Bench {
     now: Micros,
 }
 
+/// The number of a worker's PC.
+fn identity_of(peer: Peer) -> u128 {
+    match peer {
+        Peer::Worker(worker) => u128::from(worker.0) + 1,
+        Peer::Client(_) => 0,
+    }
+}
+
 impl Bench {
     fn new() -> Self {
         Bench::auditing(Share::NONE)
@@ -52,6 +60,7 @@ impl Bench {
             PeerEvent::Joined(Greeting {
                 name: format!("{peer:?}"),
                 threads,
+                identity: identity_of(peer),
                 address: Some([127, 0, 0, 1].into()),
             }),
         )
@@ -385,11 +394,25 @@ fn a_liar_is_found_out_by_audits_and_what_comes_later_is_right() {
     assert!(last_wrong.is_none_or(|last| last < 30), "{frames:?}");
     assert!(bench.farm.scheduler.is_distrusted(liar));
     assert!(bench.farm.scheduler.account().audited > 0);
-    // It comes back under its name, and is known.
+    // It comes back under another name from another address, and is known; another PC that is
+    // called as it is none.
     bench.gone(worker(2));
-    let back = Greeting { name: format!("{:?}", worker(2)), threads: 1, address: None };
-    bench.event(worker(9), PeerEvent::Joined(back));
-    assert!(bench.farm.scheduler.is_distrusted(WorkerId(9)));
+    for (number, name, identity, is_known) in [
+        (9, "renamed", identity_of(worker(2)), true),
+        (10, &*format!("{:?}", worker(2)), identity_of(worker(10)), false),
+    ] {
+        let address = Some([10, 0, 0, 9].into());
+        let back = Greeting { name: name.to_owned(), threads: 1, identity, address };
+        bench.event(worker(number), PeerEvent::Joined(back));
+        assert_eq!(bench.farm.scheduler.is_distrusted(WorkerId(number)), is_known, "{name}");
+    }
+    // Once it is cleared it stays so.
+    bench.farm.trust_again(WorkerId(9));
+    let address = None;
+    let (name, identity) = ("again".to_owned(), identity_of(worker(2)));
+    let back = Greeting { name, threads: 1, identity, address };
+    bench.event(worker(11), PeerEvent::Joined(back));
+    assert!(!bench.farm.scheduler.is_distrusted(WorkerId(11)));
 }
 
 #[test]
@@ -489,7 +512,10 @@ fn workers_of_other_pcs_are_not_sent_to_a_port_of_this_one() {
     bench.farm.redirect_above(0);
     bench.join(worker(1), 1);
     let address = Some([10, 0, 0, 7].into());
-    bench.event(worker(2), PeerEvent::Joined(Greeting { name: "far".into(), threads: 1, address }));
+    bench.event(
+        worker(2),
+        PeerEvent::Joined(Greeting { name: "far".into(), threads: 1, identity: 0, address }),
+    );
     let (bytes, hash) = (Bytes::from_static(b"a tile"), hash_of(b"a tile"));
     let want = WantBlobs { hashes: vec![hash], elsewhere: true };
     for number in [1, 2] {

@@ -1,16 +1,16 @@
 //! Whom the farm believes: what audits need of pixels, and what they find.
 
-use super::Farm;
+use super::{Farm, Greeting};
 use crate::shots::Doubt;
-use std::collections::BTreeSet;
+use std::collections::VecDeque;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use terrafarm_common::id::{FrameIndex, ShotId, WorkerId};
 use terrafarm_common::region::Region;
 use terrafarm_sched::{Distrust, Micros, SentFrames};
 use terrafarm_wire::message::Timesheet;
 
-/// Most names of distrusted workers that are remembered; of more, some are forgotten.
-const NAMES_MAX: usize = 4096;
+/// Most distrusted workers that are remembered; of more, the first ones are forgotten.
+const CULPRITS_MAX: usize = 4096;
 
 /// What the farm knows for its audits.
 #[derive(Debug)]
@@ -19,13 +19,13 @@ pub(super) struct Trust {
     /// others. `None` where nothing is audited.
     key: Option<RandomState>,
     /// Workers that were at fault: one that connects again is not believed for that.
-    distrusted: BTreeSet<String>,
+    culprits: VecDeque<Greeting>,
 }
 
 impl Trust {
     /// Nobody is distrusted. Without audits, pixels need no digest.
     pub(super) fn new(is_auditing: bool) -> Self {
-        Trust { key: is_auditing.then(RandomState::new), distrusted: BTreeSet::new() }
+        Trust { key: is_auditing.then(RandomState::new), culprits: VecDeque::new() }
     }
 
     /// A number that equal pixels share.
@@ -37,10 +37,32 @@ impl Trust {
         })
     }
 
-    /// Whether a worker of this name was at fault.
-    pub(super) fn is_distrusted(&self, name: &str) -> bool {
-        self.distrusted.contains(name)
+    /// Whether a worker is one that was at fault.
+    pub(super) fn is_distrusted(&self, worker: &Greeting) -> bool {
+        self.culprits.iter().any(|culprit| is_the_same(culprit, worker))
     }
+
+    fn distrust(&mut self, worker: Greeting) {
+        if !self.is_distrusted(&worker) {
+            if self.culprits.len() >= CULPRITS_MAX {
+                self.culprits.pop_front();
+            }
+            self.culprits.push_back(worker);
+        }
+    }
+
+    fn believe(&mut self, worker: &Greeting) {
+        self.culprits.retain(|culprit| !is_the_same(culprit, worker));
+    }
+}
+
+/// Whether two workers run on the same PC, as far as one can tell: they give the same number
+/// of it, or connect from the same address by the same name. A name alone says nothing (two
+/// PCs may be called alike), nor does an address (many may share one). Nothing of it is
+/// proved: this is for memory that fails, not for those who lie.
+fn is_the_same(one: &Greeting, other: &Greeting) -> bool {
+    let same_number = one.identity != 0 && one.identity == other.identity;
+    same_number || (&one.name, one.address) == (&other.name, other.address)
 }
 
 impl Farm {
@@ -59,7 +81,7 @@ impl Farm {
         self.count_waste(now, worker, shot, sheet);
     }
 
-    /// Reports a worker that was at fault, and remembers its name.
+    /// Reports a worker that was at fault, and remembers it.
     pub(super) fn distrust(&mut self, worker: WorkerId, why: &Distrust, sent: &[SentFrames]) {
         let name = self.name_of(worker);
         tracing::error!(
@@ -79,11 +101,8 @@ impl Farm {
                 "audit: {numbers} were sent with pixels of it; {again}"
             );
         }
-        if !name.is_empty() {
-            if self.trust.distrusted.len() >= NAMES_MAX {
-                self.trust.distrusted.pop_first();
-            }
-            self.trust.distrusted.insert(name);
+        if let Some(state) = self.workers.get(&worker) {
+            self.trust.distrust(state.greeting.clone());
         }
     }
 
@@ -91,7 +110,9 @@ impl Farm {
     pub(super) fn trust_again(&mut self, worker: WorkerId) {
         let name = self.name_of(worker);
         tracing::info!(%worker, %name, "worker is trusted again");
-        self.trust.distrusted.remove(&name);
+        if let Some(state) = self.workers.get(&worker) {
+            self.trust.believe(&state.greeting);
+        }
     }
 
     /// Reports that nobody can tell who is right.
@@ -153,6 +174,44 @@ mod tests {
         assert_ne!(trust.digest(&[1, 2, 3]), trust.digest(&[1, 2, 4]));
         assert_ne!(trust.digest(&[1, 2, 3]), Trust::new(true).digest(&[1, 2, 3]), "keys differ");
         assert_eq!(Trust::new(false).digest(&[1, 2, 3]), 0);
+    }
+
+    fn greeting(name: &str, identity: u128, address: u8) -> Greeting {
+        let address = Some(std::net::IpAddr::from([10, 0, 0, address]));
+        Greeting { name: name.to_owned(), threads: 4, identity, address }
+    }
+
+    #[test]
+    fn a_culprit_is_known_under_another_name_and_another_pc_of_its_name_is_none() {
+        let mut trust = Trust::new(true);
+        trust.distrust(greeting("render", 7, 1));
+        trust.distrust(greeting("nobody", 0, 1));
+        for (worker, is_known) in [
+            (greeting("render", 7, 1), true),
+            (greeting("renamed", 7, 1), true),
+            (greeting("renamed-and-moved", 7, 2), true),
+            (greeting("render", 8, 1), true),
+            (greeting("render", 8, 2), false),
+            (greeting("render", 0, 2), false),
+            (greeting("other", 0, 1), false),
+            (greeting("nobody", 0, 1), true),
+            (greeting("nobody", 0, 2), false),
+        ] {
+            assert_eq!(trust.is_distrusted(&worker), is_known, "{worker:?}");
+        }
+        trust.believe(&greeting("renamed", 7, 3));
+        assert!(!trust.is_distrusted(&greeting("render", 7, 1)));
+        assert!(trust.is_distrusted(&greeting("nobody", 0, 1)), "only the one that was cleared");
+    }
+
+    #[test]
+    fn so_many_culprits_are_remembered_and_the_first_is_forgotten() {
+        let mut trust = Trust::new(true);
+        (1..=CULPRITS_MAX as u128 + 1).for_each(|n| trust.distrust(greeting(&n.to_string(), n, 1)));
+        assert_eq!(trust.culprits.len(), CULPRITS_MAX);
+        assert!(
+            !trust.is_distrusted(&greeting("a", 1, 2)) && trust.is_distrusted(&greeting("a", 2, 2))
+        );
     }
 
     #[test]

@@ -55,7 +55,7 @@ async fn is_let_in_through(bits: &[u8]) -> (bool, usize) {
     let ((near, near_side), (far_side, far)) = (duplex(PIPE), duplex(PIPE));
     let token = token();
     let worker = async {
-        let role = Role::Worker { threads: 1, incarnation: 1 };
+        let role = Role::Worker { threads: 1, incarnation: 1, identity: 1 };
         drop(greet(near, Some(&token), Hello::new("fuzz", role), LIMIT).await);
     };
     let coordinator = async { accept(far, Some(&token), "terrafarm fuzz", LIMIT).await.is_ok() };

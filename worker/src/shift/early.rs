@@ -34,7 +34,7 @@ impl<C: Caster> Shift<'_, C> {
     pub(super) fn stock(&mut self, blob: Blob) -> Option<Event> {
         let Blob { hash, bytes } = blob;
         let room = self.site.terrain.has_room_ahead();
-        let cache = self.site.cache.clone();
+        let (cache, failed) = (self.site.cache.clone(), self.site.cache_failed.clone());
         if !room && cache.is_none() {
             return Some(Event::NoRoom(hash));
         }
@@ -43,7 +43,7 @@ impl<C: Caster> Shift<'_, C> {
                 if hash_of(&bytes) != hash {
                     return Report::Damaged(hash);
                 }
-                keep(cache.as_deref(), &hash, &bytes);
+                keep(cache.as_deref(), &failed, &hash, &bytes);
                 if room { early(hash, &bytes) } else { Report::Early(hash, None) }
             },
             move |panic| Report::Spoiled(hash, panic),

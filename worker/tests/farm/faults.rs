@@ -226,8 +226,8 @@ async fn nobody_there_is_an_error_that_says_where_and_what_to_check() {
     let coordinator = Coordinator::new().await;
     let mut config = coordinator.config(None);
     config.reconnect = Reconnect::NEVER;
+    let address = coordinator.listener.local_addr().unwrap();
     drop(coordinator);
-    let address = config.coordinator.clone();
     let error = start(config).ended.await.unwrap().unwrap_err().to_string();
     assert!(error.starts_with(&format!("cannot reach coordinator {address}: ")), "{error}");
     assert!(error.ends_with("and the port open?"), "{error}");

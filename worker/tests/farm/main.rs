@@ -10,5 +10,7 @@ mod script;
 mod faults;
 /// Terrain before its turn, and from worker to worker.
 mod peers;
+/// Whom a worker finds that was told no address.
+mod search;
 /// Jobs, terrain, pixels, and leaving.
 mod work;

@@ -14,7 +14,8 @@ use terrafarm_wire::message::{Blob, Hello, NoBlob, Pong, WantBlobs};
 use terrafarm_worker::office::Rules;
 use terrafarm_worker::render::Scene;
 use terrafarm_worker::{
-    Caster, Ended, RayCaster, Reconnect, ShareTiles, WorkerConfig, WorkerError, run_with,
+    Caster, Ended, RayCaster, Reconnect, ShareTiles, Whereabouts, WorkerConfig, WorkerError,
+    run_with,
 };
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -49,7 +50,7 @@ impl Coordinator {
 
     pub fn config(&self, cache_dir: Option<&Path>) -> WorkerConfig {
         WorkerConfig {
-            coordinator: self.listener.local_addr().unwrap().to_string(),
+            coordinator: Whereabouts::At(self.listener.local_addr().unwrap().to_string()),
             trust: Trust::Loopback,
             name: "pc-1".to_owned(),
             threads: 2,
@@ -65,6 +66,7 @@ impl Coordinator {
                 longest: Duration::from_millis(5),
             },
             seed: 5,
+            identity: 7,
         }
     }
 

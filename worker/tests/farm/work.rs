@@ -15,7 +15,7 @@ async fn the_pixels_are_those_of_the_ray_caster_however_the_frame_is_cut() {
     let running = start(coordinator.config(None));
     let mut peer = coordinator.welcome().await;
     assert_eq!(peer.hello.name, "pc-1");
-    assert_eq!(peer.hello.role, Role::Worker { threads: 2, incarnation: 5 });
+    assert_eq!(peer.hello.role, Role::Worker { threads: 2, incarnation: 5, identity: 7 });
     peer.send(terrain.open(1, 1)).await;
     let mut regions = columns(SIZE.0, SIZE.1, &[1, 40, 41, 90]);
     regions.push(whole());

@@ -70,31 +70,67 @@ pub async fn greet<S: AsyncRead + AsyncWrite>(
     hello: Hello,
     limit: Duration,
 ) -> Result<(Connection<S>, Welcome), HandshakeError> {
+    let exchange = async { approach(stream, token).await?.exchange(hello).await };
+    tokio::time::timeout(limit, exchange).await.map_err(|_| HandshakeError::TimedOut(limit))?
+}
+
+/// The first half of [`greet`], for a choice among several coordinators: proves the token and
+/// has it proved if there is one. Nobody has been greeted: whoever is not chosen sees a
+/// stranger leave.
+pub async fn prove<S: AsyncRead + AsyncWrite>(
+    stream: S,
+    token: Option<&FarmToken>,
+    limit: Duration,
+) -> Result<Proved<S>, HandshakeError> {
+    let proving = tokio::time::timeout(limit, approach(stream, token));
+    proving.await.map_err(|_| HandshakeError::TimedOut(limit))?
+}
+
+/// A link to a coordinator that has proved the token, if there is one.
+#[derive(Debug)]
+pub struct Proved<S>(Connection<S>);
+
+async fn approach<S: AsyncRead + AsyncWrite>(
+    stream: S,
+    token: Option<&FarmToken>,
+) -> Result<Proved<S>, HandshakeError> {
     let mut connection = Connection::new(stream);
-    let ours = hello.versions;
-    let exchange = async {
-        if let Some(token) = token {
-            open_channel(&mut connection, token).await?;
-        }
+    if let Some(token) = token {
+        open_channel(&mut connection, token).await?;
+    }
+    Ok(Proved(connection))
+}
+
+impl<S: AsyncRead + AsyncWrite> Proved<S> {
+    /// The second half of [`greet`].
+    pub async fn greet(
+        self,
+        hello: Hello,
+        limit: Duration,
+    ) -> Result<(Connection<S>, Welcome), HandshakeError> {
+        let exchange = tokio::time::timeout(limit, self.exchange(hello));
+        exchange.await.map_err(|_| HandshakeError::TimedOut(limit))?
+    }
+
+    async fn exchange(self, hello: Hello) -> Result<(Connection<S>, Welcome), HandshakeError> {
+        let Proved(mut connection) = self;
+        let ours = hello.versions;
         connection.send(&hello.into()).await?;
-        Ok(connection.recv().await?)
-    };
-    match tokio::time::timeout(limit, exchange).await {
-        Err(_) => Err(HandshakeError::TimedOut(limit)),
-        Ok(Ok(Some(Message::Welcome(welcome)))) => {
-            let spoken = ours.oldest..=ours.newest;
-            if !spoken.contains(&welcome.version) {
-                return Err(HandshakeError::OutOfPlace);
+        match connection.recv().await? {
+            Some(Message::Welcome(welcome)) => {
+                let spoken = ours.oldest..=ours.newest;
+                if !spoken.contains(&welcome.version) {
+                    return Err(HandshakeError::OutOfPlace);
+                }
+                connection.open(welcome.version);
+                Ok((connection, welcome))
             }
-            connection.open(welcome.version);
-            Ok((connection, welcome))
+            Some(Message::Refused(Refused { refusal, text })) => {
+                Err(HandshakeError::Refused { refusal, text })
+            }
+            Some(_) => Err(HandshakeError::OutOfPlace),
+            None => Err(HandshakeError::Hangup),
         }
-        Ok(Ok(Some(Message::Refused(Refused { refusal, text })))) => {
-            Err(HandshakeError::Refused { refusal, text })
-        }
-        Ok(Ok(Some(_))) => Err(HandshakeError::OutOfPlace),
-        Ok(Ok(None)) => Err(HandshakeError::Hangup),
-        Ok(Err(broken)) => Err(broken),
     }
 }
 

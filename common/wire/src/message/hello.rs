@@ -37,6 +37,9 @@ pub enum Role {
         /// A number drawn when the program started: the same one after a reconnect, so
         /// that the coordinator can tell a return from a newcomer of the same name.
         incarnation: u64,
+        /// A number of the PC, the same one after a new start and whatever the worker is
+        /// called; 0 where there is none that lasts. Nobody proves it.
+        identity: u128,
     },
     /// Submits shots, supplies their terrain, takes their frames.
     Client,

@@ -92,7 +92,7 @@ pub fn all() -> Vec<(String, Message)> {
     };
     let messages: Vec<Message> = vec![
         hello(Role::Client).into(),
-        hello(Role::Worker { threads: 16, incarnation: u64::MAX }).into(),
+        hello(Role::Worker { threads: 16, incarnation: u64::MAX, identity: u128::MAX - 1 }).into(),
         Welcome {
             version: 1,
             id: 9,

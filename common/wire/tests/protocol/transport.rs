@@ -37,7 +37,7 @@ async fn tcp() -> (TcpStream, TcpStream) {
 }
 
 pub fn hello() -> Hello {
-    Hello::new("pc-1", Role::Worker { threads: 4, incarnation: 8 })
+    Hello::new("pc-1", Role::Worker { threads: 4, incarnation: 8, identity: 9 })
 }
 
 async fn connect<S: Stream>(pair: (S, S)) -> (Connection<S>, Connection<S>) {
