@@ -22,7 +22,7 @@ use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::WorkerId;
 use terrafarm_sched::{LostReason, Micros};
-use terrafarm_wire::link::{self, Meter, Outbox, OutboxEnd, Trust, is_this_pc};
+use terrafarm_wire::link::{self, Meter, Outbox, OutboxEnd, Trust, Unsent, is_this_pc};
 use terrafarm_wire::message::{Goodbye, Message};
 use terrafarm_wire::pixels::Pixels;
 use tokio::net::TcpListener;
@@ -412,10 +412,12 @@ fn carry(
         Out::Send(peer, message) => {
             let line = lines.get(&peer)?;
             let optional = matches!(message, Message::Progress(_));
-            if line.outbox.try_send(message).is_err() && !optional {
-                return give_up(lines, peer);
+            match line.outbox.try_send(message) {
+                Err(Unsent::Full) if !optional => give_up(lines, peer),
+                // Where the connection has ended, its reader says how: perhaps with a goodbye
+                // that is still on its way to here.
+                Err(Unsent::Full | Unsent::Closed) | Ok(()) => None,
             }
-            None
         }
         Out::SendFrame(client, head, picture) => {
             let peer = Peer::Client(client);

@@ -299,6 +299,9 @@ impl<'a, C: Caster> Shift<'a, C> {
         if self.site.terrain.has_store(hash) {
             return Some(Event::Loaded(hash));
         }
+        if self.site.terrain.has_come(hash) {
+            return Some(Event::Loaded(hash));
+        }
         if let Some(tile) = self.site.terrain.take_stowed(hash) {
             return Some(self.add_tile(hash, &tile));
         }

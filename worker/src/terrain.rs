@@ -232,6 +232,21 @@ impl<P> Terrain<P> {
         self.pantry.give_up(hash);
     }
 
+    /// Whether a tile lies wherever it is awaited: it has come while the job rendered that
+    /// says that it waits for it, as tiles do that a live job did without. It is not awaited
+    /// any more then.
+    pub fn has_come(&mut self, hash: BlobHash) -> bool {
+        let is_here = |place: &Place| {
+            let store = self.stores.get(&place.store);
+            store.is_some_and(|store| store.resident.is_loaded(place.key))
+        };
+        let has_come = self.awaited.get(&hash).is_some_and(|places| places.iter().all(is_here));
+        if has_come {
+            self.awaited.remove(&hash);
+        }
+        has_come
+    }
+
     /// Puts a tile wherever it is awaited; one that nobody awaits is dropped. Says what is
     /// wrong if it does not belong there.
     pub fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Result<(), String> {

@@ -133,6 +133,20 @@ fn the_root_is_loaded_with_the_first_tile_and_stays() {
 }
 
 #[test]
+fn a_tile_that_came_while_a_job_rendered_is_not_fetched_again() {
+    let mut terrain = terrain(6);
+    let awaited = terrain.await_tiles(STORE, &[key(1)]);
+    assert!(awaited.iter().all(|&hash| !terrain.has_come(hash)));
+    for &hash in &awaited {
+        terrain.add_tile(hash, &tile()).expect("it belongs there");
+    }
+    // A job that began before says so now.
+    let hash = *terrain.await_tiles(STORE, &[key(1)]).first().expect("a tile");
+    assert!(terrain.has_come(hash));
+    assert!(!terrain.has_come(hash), "nobody awaits it any more");
+}
+
+#[test]
 fn a_tile_that_nobody_awaits_changes_nothing() {
     let mut terrain = terrain(9);
     terrain.await_tiles(STORE, &[key(0)]);
