@@ -195,8 +195,6 @@ pub struct Job<C: Caster> {
     spent: Duration,
     /// How much of it others had the cores, all threads together.
     coreless: AtomicU64,
-    /// It settled for what is at hand, and there was nothing.
-    has_nothing: bool,
 }
 
 struct Piece<C: Caster> {
@@ -268,37 +266,39 @@ impl<C: Caster> Job<C> {
             stop,
             spent: Duration::ZERO,
             coreless: AtomicU64::new(0),
-            has_nothing: false,
         }
     }
 
     /// Renders what can be rendered, on the thread pool it is called on, by as many threads
     /// as the gate lets. Gives the reason if the ray caster panics.
     pub fn advance(
-        mut self: Box<Self>,
+        self: Box<Self>,
         caster: &C,
         scene: &Scene<C::Prepared>,
         gate: &Gate,
     ) -> Result<Outcome<C>, String> {
-        self.has_nothing = false;
         self.go(caster, gate, |piece, view, frame| piece.advance(caster, scene, view, frame))
     }
 
     /// As [`Job::advance`], but nothing is tried again: what waits for tiles is shown as it is
     /// at hand, and not measured. A job still waits if there is nothing to show.
     pub fn settle(
-        mut self: Box<Self>,
+        self: Box<Self>,
         caster: &C,
         scene: &Scene<C::Prepared>,
         gate: &Gate,
     ) -> Result<Outcome<C>, String> {
-        self.has_nothing = true;
-        self.go(caster, gate, |piece, view, _| piece.settle(caster, scene, view))
-    }
-
-    /// Whether it waits because there was nothing to show at all.
-    pub fn has_nothing_to_show(&self) -> bool {
-        self.has_nothing
+        let outcome = self.go(caster, gate, |piece, view, _| piece.settle(caster, scene, view))?;
+        Ok(match outcome {
+            Outcome::Missing(job, keys) => {
+                // With the roots there is something to show: it waits for no more.
+                let resident = &scene.resident;
+                let mut roots = resident.index().roots();
+                roots.retain(|root| !resident.is_loaded(*root));
+                Outcome::Missing(job, if roots.is_empty() { keys } else { roots })
+            }
+            outcome => outcome,
+        })
     }
 
     fn go(

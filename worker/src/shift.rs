@@ -450,12 +450,7 @@ impl<'a, C: Caster> Shift<'a, C> {
             Report::Missing(job, keys) => {
                 let lease = job.lease;
                 let store = self.current.as_ref().map(|(store, _)| *store);
-                // With the roots there is something to show, so a live job waits for no more.
-                let roots = store.filter(|_| job.has_nothing_to_show());
-                let roots = roots.map(|store| terrain.await_tiles(store, &[]));
-                let hashes = roots
-                    .filter(|roots| !roots.is_empty())
-                    .or_else(|| store.map(|store| terrain.await_tiles(store, &keys)));
+                let hashes = store.map(|store| terrain.await_tiles(store, &keys));
                 match hashes {
                     Some(hashes) if !hashes.is_empty() => {
                         self.paused = Some(job);

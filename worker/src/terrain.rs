@@ -45,6 +45,8 @@ pub struct Terrain<P> {
     stores: BTreeMap<BlobHash, Store<P>>,
     /// Places that wait for a tile, by its hash. The same tile may lie at many: sea does.
     awaited: BTreeMap<BlobHash, Vec<Place>>,
+    /// Where the job before it awaited tiles: what comes late is kept for those that follow.
+    awaited_before: BTreeMap<BlobHash, Vec<Place>>,
     /// Tiles in memory, in the order in which they came.
     loaded: Vec<Loaded>,
     bytes: u64,
@@ -84,6 +86,7 @@ impl<P> Terrain<P> {
         Terrain {
             stores: BTreeMap::new(),
             awaited: BTreeMap::new(),
+            awaited_before: BTreeMap::new(),
             loaded: Vec::new(),
             bytes: 0,
             limit_bytes,
@@ -146,10 +149,10 @@ impl<P> Terrain<P> {
         self.pantry.forget_shot(shot);
     }
 
-    /// A new job begins: nothing is kept for the one before it, and the tiles come in that
+    /// A new job begins: no tile has to stay for the one before it, and the tiles come in that
     /// were fetched for it or for frames before.
     pub fn begin_job(&mut self, shot: ShotId, frame: FrameIndex) {
-        self.awaited.clear();
+        self.awaited_before = std::mem::take(&mut self.awaited);
         self.loaded.iter_mut().for_each(|loaded| loaded.pinned = false);
         self.stores.values().for_each(|store| store.resident.next_round());
         for (places, tile) in self.pantry.take_due(Due { shot, frame }) {
@@ -250,8 +253,11 @@ impl<P> Terrain<P> {
     /// Puts a tile wherever it is awaited; one that nobody awaits is dropped. Says what is
     /// wrong if it does not belong there.
     pub fn add_tile(&mut self, hash: BlobHash, tile: &Tile) -> Result<(), String> {
-        let places = self.awaited.remove(&hash).unwrap_or_default();
-        let added = self.insert(places, tile, true);
+        let before = self.awaited_before.remove(&hash);
+        let added = match self.awaited.remove(&hash) {
+            Some(places) => self.insert(places, tile, true),
+            None => self.insert(before.unwrap_or_default(), tile, false),
+        };
         self.trim();
         added
     }
@@ -295,6 +301,7 @@ impl<P> Terrain<P> {
     /// A tile cannot be had.
     pub fn give_up(&mut self, hash: BlobHash) {
         self.awaited.remove(&hash);
+        self.awaited_before.remove(&hash);
         self.pantry.give_up(hash);
     }
 

@@ -151,9 +151,24 @@ fn a_tile_that_nobody_awaits_changes_nothing() {
     let mut terrain = terrain(9);
     terrain.await_tiles(STORE, &[key(0)]);
     terrain.begin_job(SHOT, 0);
+    terrain.begin_job(SHOT, 1);
     terrain.add_tile(BlobHash([10; 32]), &tile()).expect("it is dropped");
     assert!(in_memory(&terrain).is_empty());
     assert_eq!(terrain.bytes(), 0);
+}
+
+#[test]
+fn a_tile_that_comes_one_job_late_is_there_for_the_next_and_does_not_have_to_stay() {
+    let mut terrain = terrain(3);
+    let awaited = terrain.await_tiles(STORE, &[key(0)]);
+    terrain.begin_job(SHOT, 0);
+    for hash in awaited {
+        terrain.add_tile(hash, &tile()).expect("it belongs there");
+    }
+    assert!(in_memory(&terrain).contains(&0));
+    // The job needs three others, and there is room for three.
+    load(&mut terrain, &[key(1), key(2), key(3)]);
+    assert_eq!(in_memory(&terrain), [1, 2, 3]);
 }
 
 #[test]
