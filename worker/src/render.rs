@@ -225,8 +225,8 @@ pub struct Picture {
     pub pixels: Vec<u8>,
     /// Rays, steps and the like; those of the check left out.
     pub stats: Stats,
-    /// Pixels that show coarser terrain, because it had not come: counted by pieces of
-    /// [`PIECE_PX`], of ground and colour whichever is more.
+    /// Pixels that show coarser terrain, because it had not come: counted by pieces
+    /// of the job, of ground and colour whichever is more.
     pub coarser: u64,
     /// The errors of the pixels that were measured, if any were to be.
     pub errors: Option<Summary>,
