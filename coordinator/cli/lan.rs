@@ -114,12 +114,12 @@ impl Search for Lan {
         match news {
             News::Waiting(why) => {
                 why.iter().for_each(|why| eprintln!("terrafarm: {why}"));
-                println!("waiting for a coordinator; name one with --coordinator HOST:PORT");
+                print_line!("waiting for a coordinator; name one with --coordinator HOST:PORT");
                 notify::ready("looking for a coordinator");
             }
             News::Found { place, others } => {
                 match others.is_empty() {
-                    true => println!("found a coordinator at {place}"),
+                    true => print_line!("found a coordinator at {place}"),
                     false => eprintln!(
                         "terrafarm: warning: found a coordinator at {place}, the lowest name of \
                          several with this token; --coordinator HOST:PORT chooses another: {}",

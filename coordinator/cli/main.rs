@@ -6,6 +6,9 @@
 //! Exit codes: 0 done, 1 finished with failed frames or a bench that
 //! found a method wrong, 2 could not run.
 
+#[macro_use]
+mod print;
+
 mod args;
 mod commands;
 mod farm;

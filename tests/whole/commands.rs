@@ -441,3 +441,15 @@ fn the_example_scenes_of_real_terrain_can_be_imported_and_rendered() {
         assert!(shades.len() > 500, "{name}: only {} colours", shades.len());
     }
 }
+
+#[test]
+fn whoever_reads_only_the_first_line_ends_nothing() {
+    let mut command = terrafarm();
+    command.args(["simulate", "--workers", "2", "--frames", "3"]);
+    let mut running = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // Gone before there is anything to read.
+    drop(running.stdout.take());
+    let ended = running.wait_with_output().unwrap();
+    let said = String::from_utf8(ended.stderr).unwrap();
+    assert_eq!((ended.status.code(), said.as_str()), (Some(0), ""));
+}

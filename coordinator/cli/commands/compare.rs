@@ -43,7 +43,7 @@ pub fn run(args: &args::Compare) -> anyhow::Result<Outcome> {
     }
     let shown = args.difference.as_deref().map(|path| (path, gain));
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&report(&pairs, worst, unpaired, shown))?);
+        print_line!("{}", serde_json::to_string_pretty(&report(&pairs, worst, unpaired, shown))?);
     } else {
         print(&pairs, worst, unpaired, shown);
     }
@@ -86,29 +86,33 @@ fn print(pairs: &[Pair], worst: &Pair, unpaired: usize, shown: Option<(&Path, u3
         _ => "identical".to_owned(),
     };
     if let Some(number) = worst.number {
-        println!(
+        print_line!(
             "{} pictures: mean PSNR {} (of the mean square), mean SSIM {:.5}",
             pairs.len(),
             psnr(mean(pairs, |found| found.mse)),
             mean(pairs, |found| found.ssim)
         );
         if unpaired > 0 {
-            println!("{unpaired} pictures have no partner of the same number and were left out");
+            print_line!("{unpaired} pictures have no partner of the same number and were left out");
         }
-        println!("the worst is number {number}:");
+        print_line!("the worst is number {number}:");
     }
     let found = &worst.found;
-    println!("PSNR        {}   of 8-bit sRGB", psnr(found.mse));
-    println!("SSIM        {:.5}   of luma, 11 x 11 Gaussian of sigma 1.5", found.ssim);
+    print_line!("PSNR        {}   of 8-bit sRGB", psnr(found.mse));
+    print_line!("SSIM        {:.5}   of luma, 11 x 11 Gaussian of sigma 1.5", found.ssim);
     match found.silhouette_px {
-        Some(Spread { p50, p99, max }) => println!(
+        Some(Spread { p50, p99, max }) => print_line!(
             "silhouettes p50 {p50:.2}, p99 {p99:.2}, max {max:.2} pixels   between strong edges"
         ),
-        None => println!("silhouettes none: neither picture has a strong edge"),
+        None => print_line!("silhouettes none: neither picture has a strong edge"),
     }
-    println!("channels    p99 {:.2}, max {:.2} of 255", found.difference_p99, found.difference_max);
+    print_line!(
+        "channels    p99 {:.2}, max {:.2} of 255",
+        found.difference_p99,
+        found.difference_max
+    );
     if let Some((path, gain)) = shown {
-        println!("{}: differences times {gain}", path.display());
+        print_line!("{}: differences times {gain}", path.display());
     }
 }
 

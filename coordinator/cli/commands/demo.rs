@@ -61,14 +61,16 @@ fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<std::path::Pat
 
 fn print_next(folder: &Path) {
     let folder = folder.display();
-    println!("{folder}/poster.png: a frame of it");
-    println!();
-    println!("Next:");
-    println!("  open {folder}/demo.mp4 in a browser");
-    println!("  edit {folder}/demo.csv (the flight) or {folder}/demo.toml (the light), then");
-    println!(
+    print_line!("{folder}/poster.png: a frame of it");
+    print_line!();
+    print_line!("Next:");
+    print_line!("  open {folder}/demo.mp4 in a browser");
+    print_line!("  edit {folder}/demo.csv (the flight) or {folder}/demo.toml (the light), then");
+    print_line!(
         "    terrafarm render {folder}/demo.toml --flight {folder}/demo.csv -o {folder}/mine.mp4"
     );
-    println!("  bring your own terrain:");
-    println!("    terrafarm terrain import YOUR_DEM.tif --photo YOUR_PHOTO.tif -o yours.terrain");
+    print_line!("  bring your own terrain:");
+    print_line!(
+        "    terrafarm terrain import YOUR_DEM.tif --photo YOUR_PHOTO.tif -o yours.terrain"
+    );
 }

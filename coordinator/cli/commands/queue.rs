@@ -17,7 +17,6 @@ use bytes::Bytes;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::json;
-use std::io::Write;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use terrafarm_coordinator::ask::{Answer, Line, Turn};
@@ -139,7 +138,7 @@ fn query(text: &str) -> anyhow::Result<&str> {
 }
 
 fn say(text: &str) -> anyhow::Result<Outcome> {
-    writeln!(std::io::stdout(), "{text}").context("cannot print")?;
+    print_line!("{text}");
     Ok(Outcome::Done)
 }
 

@@ -97,10 +97,10 @@ fn check_json(errors: &Summary) -> serde_json::Value {
 
 fn print_check(errors: &Summary) {
     let Some(error) = errors.error_px() else {
-        println!("checked: no pixel; a larger share would choose some");
+        print_line!("checked: no pixel; a larger share would choose some");
         return;
     };
-    println!(
+    print_line!(
         "checked {} pixels against exact: error p50 {:.3}, p99 {:.3}, max {:.3} pixels",
         errors.samples(),
         error.p50,
@@ -109,11 +109,13 @@ fn print_check(errors: &Summary) {
     );
     let other = 100.0 * errors.mismatch();
     match errors.depth_m() {
-        Some(depth) => println!(
+        Some(depth) => print_line!(
             "  depth p50 {:.3}, p99 {:.3}, max {:.3} m; {other:.2} % see another cell or sky",
-            depth.p50, depth.p99, depth.max
+            depth.p50,
+            depth.p99,
+            depth.max
         ),
-        None => println!(
+        None => print_line!(
             "  no depth to compare; {other:.2} % see ground in place of sky or sky in place of ground"
         ),
     }
@@ -148,11 +150,11 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
             "coarser_pixels": report.manifest.coarser_pixels,
             "check": report.errors.as_ref().map(check_json),
         });
-        println!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
+        print_line!("{}", serde_json::to_string_pretty(&summary).context("cannot print JSON")?);
         return Ok(());
     }
     let [width, height] = report.manifest.size;
-    println!(
+    print_line!(
         "{}: {frames} frames of {width} x {height} in {:.1} s ({:.1} frames/s, {} workers)",
         report.finished.output.display(),
         report.seconds,
@@ -163,7 +165,7 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
         print_check(errors);
     }
     if report.manifest.fallbacks > 0 {
-        println!(
+        print_line!(
             "{:.2} % of the pixels were not done the method's own way but by rays of their own",
             100.0 * report.manifest.fallback_share
         );
@@ -171,17 +173,19 @@ pub fn print(report: &Report, json: bool) -> anyhow::Result<()> {
     let coarser = report.manifest.coarser_pixels;
     if coarser > 0 {
         let all = f64::from(width) * f64::from(height) * frames as f64;
-        println!(
+        print_line!(
             "{:.2} % of the pixels show coarser terrain: the finer had not come yet",
             100.0 * coarser as f64 / all
         );
     }
-    println!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());
+    print_line!("{}: SHA-256, time and workers of each frame", report.manifest_path.display());
     if report.manifest.frames.iter().any(|frame| frame.below_ground) {
-        println!("warning: the camera was below the ground in some frames; see below_ground there");
+        print_line!(
+            "warning: the camera was below the ground in some frames; see below_ground there"
+        );
     }
     if !report.manifest.failed.is_empty() {
-        println!("{} frames failed and are shown in magenta", report.manifest.failed.len());
+        print_line!("{} frames failed and are shown in magenta", report.manifest.failed.len());
     }
     Ok(())
 }

@@ -52,10 +52,10 @@ pub fn coordinator(args: &args::serve::Coordinator) -> anyhow::Result<Outcome> {
         let coordinator = Coordinator::open(config, listener, web).await?;
         announce(address, &trust, source.as_ref());
         if let Some(page) = page {
-            println!("look at it:          {page}");
+            print_line!("look at it:          {page}");
         }
         if let Some(path) = coordinator.journal() {
-            println!("journal:             in {}", path.display());
+            print_line!("journal:             in {}", path.display());
         }
         let _announced = announce_on_lan(args, address);
         let stop = stop_signal();
@@ -159,14 +159,14 @@ fn announce(address: SocketAddr, trust: &Trust, source: Option<&Source>) {
         }
         _ => (String::new(), String::new()),
     };
-    println!("coordinator on {address}");
-    println!("start workers with:  {before}terrafarm worker --coordinator {reach}{after}");
-    println!(
+    print_line!("coordinator on {address}");
+    print_line!("start workers with:  {before}terrafarm worker --coordinator {reach}{after}");
+    print_line!(
         "render with:         {before}terrafarm render SCENE --flight FLIGHT -o OUT --coordinator {reach}{after}"
     );
     match source {
-        Some(Source::File(path)) => println!("farm token:          in {}", path.display()),
-        Some(Source::Variable) => println!("farm token:          from {}", secret::VARIABLE),
+        Some(Source::File(path)) => print_line!("farm token:          in {}", path.display()),
+        Some(Source::Variable) => print_line!("farm token:          from {}", secret::VARIABLE),
         None => {}
     }
 }

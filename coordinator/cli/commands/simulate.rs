@@ -72,7 +72,7 @@ fn config(args: &args::bench::Simulate) -> SimConfig {
 }
 
 fn print(report: &SimReport) {
-    println!(
+    print_line!(
         "{} workers, {} frames, seed {}: {:.1} virtual seconds, efficiency {:.1} %",
         report.workers,
         report.frames,
@@ -81,7 +81,7 @@ fn print(report: &SimReport) {
         report.efficiency * 100.0
     );
     let time = report.time;
-    println!(
+    print_line!(
         "time of the workers: {:.1} % useful, {:.1} % redone, {:.1} % waiting; {} failed frames",
         time.useful * 100.0,
         time.redone * 100.0,
@@ -89,24 +89,29 @@ fn print(report: &SimReport) {
         report.failed_frames
     );
     let latency = report.frame_latency_s;
-    println!(
+    print_line!(
         "a frame takes {:.2} s from its first job to its last pixel, p99 {:.2} s, at most {:.2} s",
-        latency.p50, latency.p99, latency.max
+        latency.p50,
+        latency.p99,
+        latency.max
     );
     let notice = report.notice_s;
     if notice.count > 0 {
-        println!(
+        print_line!(
             "{} machines without power noticed after {:.2} s, p99 {:.2} s, at most {:.2} s",
-            notice.count, notice.p50, notice.p99, notice.max
+            notice.count,
+            notice.p50,
+            notice.p99,
+            notice.max
         );
     }
     print_leases(&report.account);
-    println!("{} results of zombies, all refused", report.zombies);
+    print_line!("{} results of zombies, all refused", report.zombies);
     print_invariants(&report.invariants);
 }
 
 fn print_leases(account: &Account) {
-    println!(
+    print_line!(
         "{} leases: {} accepted, {} failed, {} expired, {} handed back, {} revoked, {} lost; \
          {} on purpose a second time; {} results refused",
         account.granted,
@@ -123,12 +128,12 @@ fn print_leases(account: &Account) {
 
 fn print_invariants(broken: &Violations) {
     if broken.is_clean() {
-        println!(
+        print_line!(
             "every frame complete once, no pixel lost or doubled, no lease held twice unless on \
              purpose, nothing of a zombie merged, nobody silent unnoticed: all invariants hold"
         );
     } else {
-        println!("broken invariants: {broken:?}");
+        print_line!("broken invariants: {broken:?}");
     }
 }
 
@@ -143,7 +148,7 @@ fn replay(path: &Path, json: Option<&Path>) -> anyhow::Result<Outcome> {
 }
 
 fn print_replay(report: &ReplayReport) {
-    println!(
+    print_line!(
         "{} events in {:.1} s, recorded by terrafarm {}: at most {} workers, {} frames, {} failed",
         report.events,
         report.span_s,
@@ -155,20 +160,23 @@ fn print_replay(report: &ReplayReport) {
     print_leases(&report.account);
     print_invariants(&report.invariants);
     if let Some(violation) = &report.first_violation {
-        println!("first violation: {violation}");
+        print_line!("first violation: {violation}");
     }
     if let Some(torn) = report.torn {
-        println!(
+        print_line!(
             "the last record, at byte {}, was not written to its end: {} bytes cut off",
-            torn.offset, torn.bytes
+            torn.offset,
+            torn.bytes
         );
     }
     match &report.first_difference {
-        None => println!(
+        None => print_line!(
             "the same {} actions after each of {} events, hash {:016x}",
-            report.actions, report.proved, report.hash
+            report.actions,
+            report.proved,
+            report.hash
         ),
-        Some(difference) => println!("the actions are not the same: {difference}"),
+        Some(difference) => print_line!("the actions are not the same: {difference}"),
     }
 }
 

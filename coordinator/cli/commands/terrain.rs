@@ -101,13 +101,13 @@ fn print_import(args: &Import, done: &ImportSummary) -> anyhow::Result<()> {
         return print_json(&summary(&reader));
     }
     for line in &done.report.inputs {
-        println!("{line}");
+        print_line!("{line}");
     }
     for warning in &done.report.warnings {
         eprintln!("terrafarm: warning: {warning}");
     }
     if done.filled_posts > 0 {
-        println!("{} void posts filled", done.filled_posts);
+        print_line!("{} void posts filled", done.filled_posts);
     }
     let error = match done.report.max_resampling_error_m {
         0.0 => "every post untouched".to_owned(),
@@ -116,8 +116,8 @@ fn print_import(args: &Import, done: &ImportSummary) -> anyhow::Result<()> {
             done.report.rms_resampling_error_m
         ),
     };
-    println!("{}: {}, {error}", args.output.display(), done.crs);
-    println!(
+    print_line!("{}: {}, {error}", args.output.display(), done.crs);
+    print_line!(
         "look at it:  terrafarm terrain hillshade {0} -o hillshade.png",
         args.output.display()
     );
@@ -137,25 +137,25 @@ fn info(store: &Path, json: bool) -> anyhow::Result<()> {
 fn print_info(info: &StoreInfo) {
     const MIB: f64 = 1048576.0;
     let [[x0, y0], [x1, y1]] = [info.min, info.max];
-    println!("crs           {}", info.crs);
-    println!(
+    print_line!("crs           {}", info.crs);
+    print_line!(
         "extent        {x0:.2} {y0:.2} to {x1:.2} {y1:.2} ({:.1} x {:.1} km)",
         (x1 - x0) / 1e3,
         (y1 - y0) / 1e3
     );
-    println!("height datum  {:?}", info.height_datum);
+    print_line!("height datum  {:?}", info.height_datum);
     match info.height_range_m {
-        Some([low, high]) => println!("heights       {low} to {high} m"),
-        None => println!("heights       none: every post is void"),
+        Some([low, high]) => print_line!("heights       {low} to {high} m"),
+        None => print_line!("heights       none: every post is void"),
     }
-    println!("voids         {} of {} posts", info.void_posts, info.height_posts);
-    println!(
+    print_line!("voids         {} of {} posts", info.void_posts, info.height_posts);
+    print_line!(
         "memory        {:.2} bytes per post of heights, all levels and maxima",
         info.bytes_per_post
     );
     for (number, layer) in info.layers.iter().enumerate() {
         let tiles: u64 = layer.levels.iter().map(|level| level.filled_tiles).sum();
-        println!(
+        print_line!(
             "layer {number}       {:?}: {} x {} posts, {} x {} m, {} levels, {tiles} tiles, bytes per post {:.2} on disk, {:.2} in memory",
             layer.kind,
             layer.posts[0],
@@ -168,18 +168,19 @@ fn print_info(info: &StoreInfo) {
         );
     }
     let report = &info.report;
-    println!(
+    print_line!(
         "resampling    largest error {:.3} m, rms {:.3} m",
-        report.max_resampling_error_m, report.rms_resampling_error_m
+        report.max_resampling_error_m,
+        report.rms_resampling_error_m
     );
     for input in &report.inputs {
-        println!("input         {input}");
+        print_line!("input         {input}");
     }
     for warning in &report.warnings {
-        println!("warning       {warning}");
+        print_line!("warning       {warning}");
     }
-    println!("made by       {}", report.made_by);
-    println!("file          {:.1} MiB, index {}", info.file_bytes as f64 / MIB, info.hash);
+    print_line!("made by       {}", report.made_by);
+    print_line!("file          {:.1} MiB, index {}", info.file_bytes as f64 / MIB, info.hash);
 }
 
 fn synth(args: &Synth) -> anyhow::Result<()> {
@@ -194,7 +195,7 @@ fn synth(args: &Synth) -> anyhow::Result<()> {
     if args.json {
         return print_json(&summary(&reader));
     }
-    println!(
+    print_line!(
         "{}: {} x {} posts, {} m apart, seed {}",
         args.output.display(),
         args.size,
@@ -230,7 +231,7 @@ fn write_hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> 
     let picture = Rgb8::from_pixels(width as u32, height as u32, pixels)
         .context("the hillshade has the wrong number of posts")?;
     poster::save(output, &picture)?;
-    println!("{}: {} x {}", output.display(), picture.width(), picture.height());
+    print_line!("{}: {} x {}", output.display(), picture.width(), picture.height());
     Ok(())
 }
 
@@ -263,7 +264,7 @@ fn cancel_on_interrupt() -> anyhow::Result<Arc<AtomicBool>> {
 }
 
 fn print_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
-    println!("{}", serde_json::to_string_pretty(value).context("cannot print JSON")?);
+    print_line!("{}", serde_json::to_string_pretty(value).context("cannot print JSON")?);
     Ok(())
 }
 

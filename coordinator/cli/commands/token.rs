@@ -21,9 +21,9 @@ pub fn run(args: &args::serve::Token) -> anyhow::Result<Outcome> {
             None => secret::make(&path)?,
         };
         if args.web {
-            println!("{}", WebKey::of(&token).as_text());
+            print_line!("{}", WebKey::of(&token).as_text());
         } else {
-            println!("{}", token.to_text());
+            print_line!("{}", token.to_text());
         }
         return Ok(Outcome::Done);
     }
@@ -36,7 +36,7 @@ pub fn run(args: &args::serve::Token) -> anyhow::Result<Outcome> {
         ),
         None => secret::keep(&path, &token)?,
     }
-    println!("{}: workers and renders of this user find the farm token there", path.display());
+    print_line!("{}: workers and renders of this user find the farm token there", path.display());
     Ok(Outcome::Done)
 }
 
