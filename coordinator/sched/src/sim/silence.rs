@@ -17,8 +17,9 @@ pub(crate) struct Silence {
 }
 
 impl Silence {
-    /// Nobody is there, and nobody waits.
+    /// Nobody is there, and nobody waits. No silence is over before a microsecond.
     pub(crate) fn new(allowed_us: u64) -> Self {
+        let allowed_us = allowed_us.max(1);
         Silence { allowed_us, live_since: None, heard: BTreeMap::new(), by_time: BTreeSet::new() }
     }
 
@@ -55,13 +56,12 @@ impl Silence {
         self.live_since = self.live_since.map(|_| now);
     }
 
-    /// A worker that should be there no longer (it goes when its time is over, one microsecond
-    /// after it came at the earliest), and how long it has been silent by the live
+    /// A worker that should be there no longer, and how long it has been silent by the live
     /// rule, microseconds. It is named once.
     pub(crate) fn overdue(&mut self, now: Micros) -> Option<(WorkerId, u64)> {
         let &(heard_at, worker) = self.by_time.first()?;
         let silent_us = now.since(self.live_since?.max(heard_at));
-        if silent_us <= self.allowed_us {
+        if silent_us < self.allowed_us {
             return None;
         }
         self.gone(worker);
@@ -83,11 +83,11 @@ mod tests {
         assert_eq!(silence.overdue(Micros(1000)), None, "nobody waits");
         silence.live(Micros(1000), true);
         silence.live(Micros(1050), true);
-        assert_eq!(silence.overdue(Micros(1100)), None);
+        assert_eq!(silence.overdue(Micros(1099)), None);
         silence.heard(Micros(1099), ONE);
-        assert_eq!(silence.overdue(Micros(1199)), None);
+        assert_eq!(silence.overdue(Micros(1198)), None);
         silence.overslept(Micros(1200));
-        assert_eq!(silence.overdue(Micros(1300)), None);
+        assert_eq!(silence.overdue(Micros(1299)), None);
         assert_eq!(silence.overdue(Micros(1305)), Some((ONE, 105)));
         assert_eq!(silence.overdue(Micros(1305)), None, "named once");
     }
@@ -99,11 +99,11 @@ mod tests {
         silence.joined(Micros(0), WorkerId(2));
         silence.live(Micros(0), true);
         silence.gone(ONE);
-        assert_eq!(silence.overdue(Micros(101)), Some((WorkerId(2), 101)));
+        assert_eq!(silence.overdue(Micros(100)), Some((WorkerId(2), 100)));
         silence.joined(Micros(100), ONE);
         silence.live(Micros(150), false);
         assert_eq!(silence.overdue(Micros(500)), None);
         silence.live(Micros(500), true);
-        assert_eq!(silence.overdue(Micros(600)), None);
+        assert_eq!(silence.overdue(Micros(599)), None);
     }
 }
