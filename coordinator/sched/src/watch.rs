@@ -15,7 +15,6 @@
 //! second by default, or the coordinator was later than that itself; the batch rule holds
 //! in any case.
 
-use crate::config::Config;
 use crate::event::{Action, DropReason, Micros};
 use crate::scheduler::{Scheduler, Timer};
 use crate::shot::Shot;
@@ -109,10 +108,15 @@ impl Scheduler {
         }
     }
 
-    /// After so much silence a worker is probed now, microseconds.
+    /// After so much silence a worker is looked at now, microseconds: probed, or dropped where
+    /// the settings let it be silent for no longer than that.
     fn heartbeat_us(&self) -> u64 {
-        let Config { heartbeat_us, live_heartbeat_us, .. } = self.config;
-        if self.live_since.is_some() { live_heartbeat_us.min(heartbeat_us) } else { heartbeat_us }
+        let config = &self.config;
+        let usual_us = config.heartbeat_us.min(config.silence_us);
+        match self.live_since {
+            Some(_) => usual_us.min(config.live_heartbeat_us).min(config.live_silence_us),
+            None => usual_us,
+        }
     }
 
     /// Looks at a worker then, and not when it was meant to before.
