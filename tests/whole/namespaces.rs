@@ -260,6 +260,7 @@ fn a_worker_whose_link_is_cut_is_missed_in_6_seconds_and_comes_back_by_itself() 
     assert!(lost.contains("silent") && lost.contains("pc-1"), "{lost}");
     one.expect("no connection to the coordinator");
     let noticed_there = since.elapsed();
+    // The length of the cut is what is tested; nothing waits for a state here.
     std::thread::sleep(cut.saturating_sub(since.elapsed()));
     farm.office.plug(1, "up");
     let since = Instant::now();
@@ -304,6 +305,7 @@ fn what_a_short_cut_held_up_is_done_by_others_and_refused_when_it_comes() {
         one.expect("job begins");
     }
     farm.office.plug(1, "down");
+    // The length of the cut is what is tested; nothing waits for a state here.
     std::thread::sleep(SILENCE / 2);
     farm.office.plug(1, "up");
     let since = Instant::now();

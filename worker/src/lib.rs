@@ -229,6 +229,7 @@ async fn work<C: Caster>(
             said = Some(why);
         }
         tokio::select! {
+            // Back-off: a coordinator that restarts is not stormed by its workers.
             () = tokio::time::sleep(pause) => {}
             () = stop.cancelled() => return Ok(Ended::Stopped),
         }

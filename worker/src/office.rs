@@ -169,6 +169,7 @@ impl Watch {
         let looking = std::thread::Builder::new().name("office".into()).spawn(move || {
             let mut before = Instant::now();
             while !told.is_closed() {
+                // No system tells when its user or another program wants the cores.
                 std::thread::sleep(LOOK);
                 let now = Instant::now();
                 let on_duty = look(now.duration_since(before));

@@ -175,6 +175,7 @@ impl House {
             };
             match tokio::task::spawn_blocking(read).await {
                 Ok(Ok(Some(bytes))) => return Some(bytes),
+                // It may be written meanwhile, and a disk does not call.
                 Ok(Ok(None)) if Instant::now() < deadline => sleep(LOOK_EVERY).await,
                 _ => return None,
             }
@@ -189,6 +190,7 @@ impl House {
             *next = turn + Duration::from_secs_f64(bytes as f64 / RATE);
             turn
         };
+        // The pause is the purpose: it is the rate.
         sleep_until(turn).await;
     }
 }

@@ -68,6 +68,7 @@ pub(crate) async fn serve(web: Web, desk: Arc<Desk>, stop: CancellationToken) {
                 }
                 Err(error) => {
                     tracing::warn!("cannot accept an HTTP connection: {error}");
+                    // Out of file handles, say: at once it would only fail again.
                     sleep(ACCEPT_PAUSE).await;
                 }
             },
