@@ -39,6 +39,10 @@ mod terrain_on_farm;
 #[path = "whole/hostile.rs"]
 mod hostile;
 
+/// A coordinator with a queue and a page, and what asks it.
+#[path = "whole/office.rs"]
+mod office;
+
 /// The coordinator's API: what it answers, whom it lets in, and how soon.
 #[path = "whole/api.rs"]
 mod api;

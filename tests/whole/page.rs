@@ -1,6 +1,6 @@
 //! The page in a headless Chromium: what it shows, and what its buttons do.
 
-use crate::api::{Office, office};
+use crate::office::{Office, office};
 use crate::support::{PATIENCE, World, worker};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};

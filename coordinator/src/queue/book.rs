@@ -47,6 +47,8 @@ pub struct Shot {
     pub lacks: Option<BlobHash>,
     /// Why the farm did not take it; it is offered again later.
     pub refused: Option<String>,
+    /// Why its own folder takes no pictures, while the disk does: it alone waits.
+    pub stuck: Option<QueueError>,
     /// Frames that have come and are not yet recorded: it does not enter the farm before
     /// they are, or they would be rendered twice.
     pub in_hand: usize,
@@ -69,6 +71,11 @@ impl Shot {
         // A record that was damaged may say anything; too much is too much.
         let in_flight = pixels.saturating_mul(u64::from(plan.frames_in_flight));
         (self.record.frames.into(), in_flight.min(PIXELS_PRESENT_MAX + 1))
+    }
+
+    /// Whether terrain and folder are as they should be.
+    pub fn may_go_on(&self) -> bool {
+        self.lacks.is_none() && self.stuck.is_none()
     }
 
     /// Whether no frame of it is missing.
@@ -98,7 +105,8 @@ impl Book {
     /// A new shot.
     pub fn add(&mut self, saved: Saved) {
         let Saved { id, record, progress } = saved;
-        self.shots.insert(id, Shot { record, progress, lacks: None, refused: None, in_hand: 0 });
+        let shot = Shot { record, progress, lacks: None, refused: None, stuck: None, in_hand: 0 };
+        self.shots.insert(id, shot);
         self.file(id);
     }
 
@@ -220,6 +228,13 @@ impl Book {
         }
     }
 
+    /// The folder of a shot fails, or does not any more.
+    pub fn set_stuck(&mut self, id: ShotId, why: Option<QueueError>) {
+        if let Some(shot) = self.shots.get_mut(&id) {
+            shot.stuck = why;
+        }
+    }
+
     /// So many more frames of a shot have come, or so many fewer are still to be recorded.
     pub fn count_in_hand(&mut self, id: ShotId, change: isize) {
         if let Some(shot) = self.shots.get_mut(&id) {
@@ -229,7 +244,8 @@ impl Book {
 
     /// The shot that is to get its manifest and film next.
     pub fn to_finish(&self) -> Option<ShotId> {
-        self.finishing.first().copied()
+        let is_free = |id: &&ShotId| self.shots.get(id).is_some_and(|shot| shot.stuck.is_none());
+        self.finishing.iter().find(is_free).copied()
     }
 
     /// A shot went to the farm, or came back.
@@ -246,7 +262,7 @@ impl Book {
         let may_run = |id: &ShotId| {
             let shot = &self.shots[id];
             let may_enter = shot.refused.is_none() && shot.in_hand == 0 && !shot.is_complete();
-            shot.lacks.is_none() && (may_enter || self.present.contains(id))
+            shot.may_go_on() && (may_enter || self.present.contains(id))
         };
         let wanted: Vec<_> =
             self.line.iter().map(|(_, id)| *id).filter(may_run).take(self.active).collect();

@@ -41,6 +41,20 @@ pub fn free_bytes(_folder: &Path) -> Option<u64> {
     None
 }
 
+/// Writes a little into a folder, which is made if it is not there, and removes it again.
+///
+/// # Errors
+/// If the folder takes no files.
+pub fn probe(queue: &Path, folder: &Path) -> Result<(), QueueError> {
+    // A name that is tidied up should this be cut off.
+    let path = folder.join("probe.partial.");
+    fs::create_dir_all(folder)
+        .and_then(|()| File::create(&path))
+        .and_then(|mut file| file.write_all(b"x").and_then(|()| file.sync_all()))
+        .and_then(|()| fs::remove_file(&path))
+        .map_err(|why| error(queue, "write into", folder, &why))
+}
+
 /// Makes the names in a folder survive a power cut, where the system can.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }

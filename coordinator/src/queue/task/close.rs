@@ -1,9 +1,10 @@
 //! What becomes durable: frames, ends of shots; and what happens when the disk says no.
 
+use super::stay::Picture;
 use super::{News, SWEEP, Task};
 use crate::queue::ledger::{ShotRecord, Stage};
 use crate::queue::pictures::{self, Unfinished};
-use crate::queue::{KEY_KEPT, OVER_MAX, QueueError, disk};
+use crate::queue::{KEY_KEPT, OVER_MAX, QueueError, blocking, disk};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use terrafarm_common::id::ShotId;
 use tokio_util::sync::CancellationToken;
@@ -89,6 +90,7 @@ impl Task {
     pub async fn give_up(&mut self, shot: ShotId) {
         self.leave(shot).await;
         self.losses.remove(&shot);
+        self.book.set_stuck(shot, None);
         if let Some((_, guard)) = self.finishing.as_mut().filter(|(other, _)| *other == shot) {
             *guard = None;
         }
@@ -165,8 +167,49 @@ impl Task {
                     Err(why) => self.stall(why).await,
                 }
             }
-            Err(Unfinished::Disk(why)) => self.stall(why).await,
+            Err(Unfinished::Disk(why)) => self.hold(shot, why).await,
             Err(Unfinished::Canceled) => {}
+        }
+    }
+
+    /// Files of a shot cannot be written. On a full disk nobody's can; else it is the shot's
+    /// own folder, and the others go on.
+    pub async fn hold(&mut self, shot: ShotId, why: QueueError) {
+        if !matches!(why, QueueError::Io { .. }) {
+            return self.stall(why).await;
+        }
+        let is_new = self.book.get(shot).is_some_and(|state| state.stuck.is_none());
+        if is_new {
+            tracing::warn!(%shot, "the shot waits: {why}");
+        }
+        self.book.set_stuck(shot, Some(why));
+        self.changed.insert(shot);
+        self.sync_pause(shot).await;
+    }
+
+    /// Looks whether folders that failed can be written to again.
+    async fn unstick(&mut self) {
+        let stuck = self.book.iter().filter(|(_, shot)| shot.stuck.is_some());
+        let folders: Vec<_> =
+            stuck.map(|(id, shot)| (id, self.files(id, &shot.record).folder)).collect();
+        for (shot, folder) in folders {
+            let queue = self.shared.config.folder.clone();
+            if let Err(why) = blocking(move || disk::probe(&queue, &folder)).await {
+                self.hold(shot, why).await;
+                continue;
+            }
+            self.book.set_stuck(shot, None);
+            self.changed.insert(shot);
+            self.write_waiting(Some(shot));
+            self.sync_pause(shot).await;
+        }
+    }
+
+    /// Writes the pictures for which there was no room, of one shot or of all.
+    fn write_waiting(&mut self, only: Option<ShotId>) {
+        let is_due = |picture: &mut Picture| only.is_none_or(|shot| picture.shot() == shot);
+        for picture in self.unwritten.extract_if(.., is_due).collect::<Vec<_>>() {
+            self.write(picture);
         }
     }
 
@@ -205,7 +248,7 @@ impl Task {
             }
         }
         if self.stalled.is_none() {
-            return;
+            return self.unstick().await;
         }
         let needed: usize =
             self.unwritten.iter().map(|picture| picture.pixels.pixels().len()).sum();
@@ -222,9 +265,7 @@ impl Task {
         for doubted in std::mem::take(&mut self.doubts) {
             self.doubt(doubted).await;
         }
-        for picture in std::mem::take(&mut self.unwritten) {
-            self.write(picture);
-        }
+        self.write_waiting(None);
         // Those whose end could not be written.
         self.check_all().await;
         if self.stalled.is_none() {
@@ -260,7 +301,7 @@ impl Task {
         (self.is_sweeping, self.swept) = (true, Some(Instant::now()));
         let (shared, tell, terrain) = (self.shared.clone(), self.tell.clone(), self.book.terrain());
         self.errands.spawn(async move {
-            let swept = crate::queue::blocking(move || {
+            let swept = blocking(move || {
                 let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
                 let before = now.saturating_sub(KEY_KEPT).as_secs();
                 shared.with_ledger(|ledger| ledger.forget_keys(before))?;

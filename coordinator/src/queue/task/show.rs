@@ -38,7 +38,8 @@ impl Task {
             let since = times.front()?.elapsed().as_secs_f64();
             (times.len() > 1).then(|| (times.len() - 1) as f64 / since.max(1e-3))
         });
-        let (state, note) = match (record.stage, &self.stalled, shot.lacks, &shot.refused) {
+        let waits_for = self.stalled.as_ref().or(shot.stuck.as_ref());
+        let (state, note) = match (record.stage, waits_for, shot.lacks, &shot.refused) {
             (Stage::Open | Stage::Finishing, Some(why), ..) => {
                 (ShotState::Stalled, why.to_string())
             }

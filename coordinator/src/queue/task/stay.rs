@@ -161,7 +161,7 @@ impl Task {
             return;
         };
         let may_run =
-            state.record.stage == Stage::Open && state.lacks.is_none() && self.stalled.is_none();
+            state.record.stage == Stage::Open && state.may_go_on() && self.stalled.is_none();
         let order = if may_run { Order::Resume(shot) } else { Order::Pause(shot) };
         // The farm may not know it yet: then this is called again.
         let _ = self.farm.order(order).await;
@@ -265,8 +265,9 @@ impl Task {
                 self.outcomes.push(Outcome { stay, frame, shot, index, record });
             }
             Err(why) => {
+                let shot = picture.shot;
                 self.unwritten.push(picture);
-                self.stall(why).await;
+                self.hold(shot, why).await;
             }
         }
     }

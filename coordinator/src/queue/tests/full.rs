@@ -1,5 +1,5 @@
 //! A disk that is full: a small one of its own where the test may mount one, as root on
-//! Linux.
+//! Linux. And the folder of one shot that takes no files, which costs that shot alone.
 
 use super::house::{self, House, Land, plan, until};
 use super::*;
@@ -97,4 +97,38 @@ async fn within_the_reserve_orders_hold_and_submissions_are_refused() {
     let _worker = house.hire(WorkerId(2)).await;
     until(&house.queue, |list| list[0].state == ShotState::Done).await;
     assert_eq!(house.queue.shots().len(), 1);
+}
+
+/// The folder of the first shot takes no picture, that of the second no manifest: both wait
+/// with the reason, the third is done, and so are they when their folders are mended.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_folder_that_fails_holds_up_its_own_shot() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let house = House::open(folder.path()).await;
+    land.send(&house.queue).await;
+    let shots = folder.path().join("shots");
+    let manifest = shots.join("000002/manifest.json");
+    fs::create_dir_all(&manifest).unwrap();
+    fs::write(shots.join("000001"), "no folder").unwrap();
+    for _ in 0..3 {
+        house.queue.submit(plan(&land, 12)).await.unwrap();
+    }
+    let _worker = house.hire(WorkerId(1)).await;
+    let states = |list: &ShotList| list.iter().map(|shot| shot.state).collect::<Vec<_>>();
+    use ShotState::{Done, Stalled};
+    until(&house.queue, |list| states(list) == [Stalled, Stalled, Done]).await;
+    for (shot, place) in [(1, "000001"), (2, "manifest.json")] {
+        let note = house.queue.shot(ShotId(shot)).unwrap().note.clone();
+        assert!(note.contains(place), "{note}");
+    }
+    fs::remove_file(shots.join("000001")).unwrap();
+    fs::remove_dir(&manifest).unwrap();
+    until(&house.queue, |list| states(list) == [Done, Done, Done]).await;
+    let mut frames = house.log();
+    // Jobs that ran when the farm was told to wait were not finished.
+    assert!(frames.len() <= 36 + 3, "{} frames were rendered", frames.len());
+    frames.sort_unstable();
+    frames.dedup();
+    assert_eq!(frames.len(), 36);
 }
