@@ -270,6 +270,42 @@ pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
     }
 }
 
+/// Aligns the stack of the function that holds one: without it, vectors that the compiler
+/// puts there for want of registers may lie across cache lines.
+#[cfg(target_arch = "x86_64")]
+#[repr(align(64))]
+struct Anchor(u8);
+
+#[cfg(target_arch = "x86_64")]
+impl Anchor {
+    #[inline(always)]
+    fn hold() {
+        std::hint::black_box(&mut Anchor(0).0);
+    }
+}
+
+/// Asks for the memory `at` bytes behind the base of each lane in `mask`, so that it is there
+/// when it is read. Any address will do.
+#[inline(always)]
+pub(crate) fn prefetch<L: Lanes>(bases: &[*const u8; MOST], at: L::I, mask: L::M) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let mut places = [0; MOST];
+        at.store(&mut places);
+        let mut bits = mask.bits();
+        while bits != 0 {
+            let lane = bits.trailing_zeros() as usize % MOST;
+            bits &= bits - 1;
+            let place = bases[lane].wrapping_offset(places[lane] as isize);
+            // SAFETY: SSE is part of the architecture, and a hint reads nothing.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(place.cast()) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (bases, at, mask);
+}
+
 /// Floats as the bits that they are.
 pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
     // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.

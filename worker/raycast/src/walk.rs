@@ -36,6 +36,8 @@ const NOWHERE: i32 = -1;
 /// Rounds of which one each is for the lanes that seek, that walk and that come to a plot,
 /// however few.
 const TURNS: u32 = 8;
+/// How many cells ahead posts are asked for; twice as many is no better.
+const AHEAD: f32 = 4.0;
 /// Cells that a ray passes one by one before it looks at blocks of them. Measured at the
 /// views of `bench core`.
 const PATIENCE: i32 = 6;
@@ -115,6 +117,8 @@ struct Steps<L: Lanes> {
     post: L::I,
     /// What to add to it to come to the next post along y.
     row: L::I,
+    /// What to add to it to come to a post about [`AHEAD`] cells further on.
+    ahead: L::I,
     /// Cells passed since the last hit.
     passed: L::I,
 }
@@ -170,6 +174,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 rest: [zero; 2],
                 post: zero,
                 row: zero,
+                ahead: zero,
                 passed: zero,
             },
             profile: Profile::new(),
@@ -299,6 +304,11 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         self.unsure = self.unsure | L::M::from_bits(unsure);
         let inside = L::M::from_bits(inside);
         self.steps.row = soil.row::<L>(self.lines.forward[1]);
+        let [x, y] = self.lines.rate;
+        let whole = x.abs() + y.abs();
+        let far = L::F::splat(AHEAD).div(whole);
+        let [x, y] = [(x * far).truncate(), (y * far).truncate()];
+        self.steps.ahead = x + y.times(L::I::load(&soil.row));
         let passing = lanes & !inside;
         if passing.any() {
             let level = L::I::splat(MAXIMA_LEVELS as i32);
@@ -377,6 +387,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let next = steps.post + L::I::select(along_x, self.lines.next, steps.row);
         steps.post = L::I::select(walking, next, steps.post);
         steps.passed = L::I::select(walking, steps.passed + one, steps.passed);
+        let ahead = steps.post + steps.ahead;
         let mut tired = walking & !leaving & L::I::splat(PATIENCE).lt(steps.passed);
         if (leaving | tired).any() {
             if leaving.any() {
@@ -397,6 +408,9 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             self.block = L::I::select(tired, one, self.block);
         }
         let going = walking & !leaving & !tired;
+        if self.fineness.apart > 0.0 {
+            soil.expect_post::<L>(ahead, going);
+        }
         self.profile.low = L::F::select(going, self.profile.high, self.profile.low);
         self.look(soil, s, going);
         tired
@@ -449,11 +463,23 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let crossed = !before.shr(parent).eq(after.shr(parent)) & block.lt(top);
         let wider = L::I::select(leaving | (moving & crossed), parent, block);
         self.block = L::I::select(blocks & !clear, block - one, wider);
+        if self.fineness.apart > 0.0 {
+            self.expect(soil, seeking & !found);
+        }
         if found.any() {
             let start = self.arrive(soil, found);
             self.look(soil, start, found);
         }
         found
+    }
+
+    /// Asks for what lanes will look at when they seek next.
+    #[inline(always)]
+    fn expect(&self, soil: &Soils, lanes: L::M) {
+        let within = [self.cell[0].shr(self.block), self.cell[1].shr(self.block)];
+        let found = self.block.eq(L::I::splat(0));
+        soil.expect_maximum::<L>(maximum::<L>(within, self.block), lanes & !found);
+        soil.expect_post::<L>(soil.post::<L>(self.cell), lanes & found);
     }
 
     /// Readies lanes to walk from the cells that they have found. Returns where their lines

@@ -7,7 +7,7 @@
 
 mod doubles;
 
-use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
+use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -34,6 +34,7 @@ impl Lanes for Eight {
 /// The processor must have AVX2, POPCNT, BMI1, BMI2 and LZCNT.
 #[target_feature(enable = "avx2,popcnt,bmi1,bmi2,lzcnt")]
 pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    Anchor::hold();
     kernel.run::<Eight>()
 }
 

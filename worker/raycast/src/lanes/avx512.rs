@@ -4,7 +4,7 @@
 
 mod doubles;
 
-use super::{Floats, Ints, Kernel, Lanes, MOST, Mask};
+use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -30,6 +30,7 @@ impl Lanes for Sixteen {
 /// The processor must have AVX-512 F, BW, DQ and VL, and what `avx2::run` asks for.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,popcnt,bmi1,bmi2,lzcnt")]
 pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    Anchor::hold();
     kernel.run::<Sixteen>()
 }
 

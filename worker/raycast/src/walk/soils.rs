@@ -1,7 +1,7 @@
 //! The tiles under N lanes, and what they say of posts and of blocks.
 
 use crate::column::{TOLD, WHOLE};
-use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
+use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, prefetch};
 use crate::relief::{Kept, Loaded};
 use terrafarm_terrain::layout::{TILE_CELLS, TILE_POSTS, TILE_RING};
 use terrafarm_terrain::tile::{Heights, MAXIMA_LEVELS, VOID};
@@ -13,7 +13,7 @@ pub(super) struct Soils {
     /// Place of the first post, from a post to the next in the north, and cells along a side
     /// less one; see [`Posts`].
     first: [i32; MOST],
-    row: [i32; MOST],
+    pub row: [i32; MOST],
     mask: [i32; MOST],
     /// Bytes of a post, of a row of them, and before the last two.
     size: [i32; MOST],
@@ -174,6 +174,18 @@ impl Soils {
         L::F::load(&self.high_base) + value * L::F::load(&self.high_step)
     }
 
+    /// Asks for the maxima of blocks that will be looked at.
+    #[inline(always)]
+    pub fn expect_maximum<L: Lanes>(&self, at: L::I, lanes: L::M) {
+        prefetch::<L>(&self.maxima, at.times(L::I::load(&self.high_size)), lanes);
+    }
+
+    /// Asks for posts that will be looked at.
+    #[inline(always)]
+    pub fn expect_post<L: Lanes>(&self, at: L::I, lanes: L::M) {
+        prefetch::<L>(&self.posts, at.times(L::I::load(&self.size)), lanes);
+    }
+
     /// Posts at and east of, and north of both, a place among them, in the lanes' units;
     /// and whether all four are there.
     #[inline(always)]
@@ -206,14 +218,13 @@ impl Soils {
         let last = L::I::load(&self.last_bytes);
         let south = at.times(size);
         let north = south + L::I::load(&self.row_bytes);
-        let values = [south, south + size, north, north + size].map(
-            #[inline(always)]
-            |at| {
-                // SAFETY: as above.
-                let bits = unsafe { L::I::gather_from(&self.posts, at, last, lanes) };
-                self.values::<L>(bits, self.wide)
-            },
-        );
+        // Closures of `map` are compiled without the kernel's features.
+        let mut values = [L::F::splat(0.0); 4];
+        for (value, at) in values.iter_mut().zip([south, south + size, north, north + size]) {
+            // SAFETY: as above.
+            let bits = unsafe { L::I::gather_from(&self.posts, at, last, lanes) };
+            *value = self.values::<L>(bits, self.wide);
+        }
         let [sw, se, nw, ne] = values;
         // A void is the highest code, or NaN, which no comparison finds to be below.
         let void = L::F::splat(f32::from(VOID));
