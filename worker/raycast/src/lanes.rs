@@ -106,6 +106,8 @@ pub(crate) trait Doubles:
     fn from_floats(floats: Self::F) -> Self;
     /// The nearest f32, as f64.
     fn to_single(self) -> Self;
+    /// The nearest f32.
+    fn to_floats(self) -> Self::F;
 }
 
 /// One i32 a lane; arithmetic wraps.

@@ -1,8 +1,11 @@
 //! Rays abreast: the walk of `exact`, a ray a lane.
 //!
 //! ```text
-//! for all rays: direction, stretch, span, where the walk begins
-//! loop
+//! for some hundred rays at a time
+//!   direction, stretch, span, where the walk begins
+//!   in f32, while it is seen that the ray clears its cell or block: go on (`approach`)
+//!   test the cells in which that has ended: nearly all meet the surface there
+//! walk, for the others, from these cells on
 //!   lanes that are done take the next rays of the list
 //!   if most lanes are at a block
 //!     those pass it or go one level down
@@ -30,6 +33,7 @@
 //! Left to the twin are rays along the lines of the grid, and rays that come to a tile
 //! which is not loaded, from their start on.
 
+mod approach;
 mod walk;
 
 use super::arc::{Globe, Rise};
@@ -38,11 +42,17 @@ use super::tiles::Tiles;
 use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
 use crate::painter::ROUNDING;
 use crate::path::{FLAT_REACH_M, REACH_RAD};
+use approach::Approach;
 use terrafarm_common::camera::Camera;
 use walk::Walk;
 
 /// The share of lanes that must be done before they take new rays: one in so many.
 const IDLE_SHARE: usize = 4;
+/// Steps from cell to cell before blocks are tried: beams end close to the ground, and a
+/// step that looks at both costs nearly twice as much.
+const CELLS_FIRST: u32 = 10;
+/// Rays that are aimed before the first of them goes on: few enough for the nearest cache.
+const BATCH: usize = 256;
 
 /// What all rays have in common.
 #[derive(Clone, Copy)]
@@ -59,6 +69,25 @@ pub(super) struct Sight<'a> {
     pub cells: [i32; 2],
     /// Highest height of the terrain, metres.
     pub highest: f64,
+    /// How far the terrain is from height 0 at most, metres.
+    pub largest: f64,
+}
+
+/// Where rays are at the start of their approach.
+struct Start<L: Lanes> {
+    begin: L::D,
+    last: L::D,
+    rate: [L::D; 2],
+    inverse: [L::D; 2],
+    z: L::D,
+    /// Rise for each unit of u.
+    fall: L::D,
+}
+
+/// The first so many lanes, at most all.
+#[inline(always)]
+fn lanes_up_to<L: Lanes>(count: usize) -> L::M {
+    if count < L::N { L::M::from_bits((1 << count) - 1) } else { !L::M::none() }
 }
 
 /// Casts all rays of a list. Returns the blocks and cells looked at.
@@ -66,6 +95,8 @@ pub(super) struct Abreast<'r, 'a> {
     pub sight: Sight<'a>,
     pub tiles: &'r mut Tiles<'a>,
     pub rays: &'r mut Rays,
+    /// Those that the walk takes.
+    pub rest: &'r mut Rays,
 }
 
 impl Kernel for Abreast<'_, '_> {
@@ -75,12 +106,12 @@ impl Kernel for Abreast<'_, '_> {
     fn run<L: Lanes>(mut self) -> u64 {
         let steps = match self.sight.globe {
             None => {
-                self.aim::<L, false>();
-                self.walk::<L, false>()
+                let steps = self.begin::<L, false>();
+                steps + self.walk::<L, false>()
             }
             Some(_) => {
-                self.aim::<L, true>();
-                self.walk::<L, true>()
+                let steps = self.begin::<L, true>();
+                steps + self.walk::<L, true>()
             }
         };
         self.measure::<L>();
@@ -89,16 +120,55 @@ impl Kernel for Abreast<'_, '_> {
 }
 
 impl Abreast<'_, '_> {
-    /// Finds for all rays where their walks begin.
+    /// Brings all rays to the first cell that they may hit, some at a time. What does not
+    /// hit there is left for the walk.
     #[inline(always)]
-    fn aim<L: Lanes, const ROUND: bool>(&mut self) {
+    fn begin<L: Lanes, const ROUND: bool>(&mut self) -> u64 {
+        self.rest.count = 0;
         let count = self.rays.count;
-        let mut at = 0;
-        while at < count {
-            self.aim_at::<L, ROUND>(at);
-            at += L::N;
+        let mut steps = 0;
+        let mut fleet = Vec::with_capacity(BATCH / L::N);
+        let mut under_way = [0; BATCH];
+        let mut from = 0;
+        while from < count {
+            let to = count.min(from + BATCH);
+            fleet.clear();
+            let mut at = from;
+            while at < to {
+                fleet.push(self.aim_at::<L, ROUND>(at, lanes_up_to::<L>(to - at)));
+                at += L::N;
+            }
+            let mut left = fleet.len();
+            for (n, number) in under_way[..left].iter_mut().enumerate() {
+                *number = n;
+            }
+            let mut turn = 0;
+            while left > 0 {
+                let mut kept = 0;
+                for n in 0..left {
+                    let number = under_way[n];
+                    let approach: &mut Approach<L> = &mut fleet[number];
+                    steps += if turn < CELLS_FIRST {
+                        approach.step_cells(&self.sight, self.tiles)
+                    } else {
+                        approach.step(&self.sight, self.tiles)
+                    };
+                    under_way[kept] = number;
+                    kept += usize::from(approach.active.any());
+                }
+                left = kept;
+                turn += 1;
+            }
+            let mut at = from;
+            for approach in &fleet {
+                self.touch_at::<L, ROUND>(at, approach.cell, lanes_up_to::<L>(to - at));
+                at += L::N;
+            }
+            from = to;
         }
-        self.rays.part_mut(Part::Last)[count..count + MOST].fill(f64::NEG_INFINITY);
+        let count = self.rest.count;
+        self.rest.part_mut(Part::Last)[count..count + MOST].fill(f64::NEG_INFINITY);
+        steps
     }
 
     /// Unit directions of N rays, and the parameters up to which they are free.
@@ -122,7 +192,7 @@ impl Abreast<'_, '_> {
     }
 
     #[inline(always)]
-    fn aim_at<L: Lanes, const ROUND: bool>(&mut self, at: usize) {
+    fn aim_at<L: Lanes, const ROUND: bool>(&mut self, at: usize, lanes: L::M) -> Approach<L> {
         let sight = self.sight;
         let ([x, y, up], free) = self.directions::<L>(at);
         let across = x * x + y * y;
@@ -152,11 +222,13 @@ impl Abreast<'_, '_> {
         let begin = enter.max(free);
         let mut over = enter.lt(exit) & free.lt(exit);
         let (mut first, mut last) = (enter, exit);
-        let z;
+        let (z, fall);
         if let (true, Some(globe)) = (ROUND, sight.globe) {
             let (spans, uncountable) = globe.spans_at::<L>(&rise, begin);
             open = open | uncountable;
             z = spans.z(begin);
+            let since = begin - spans.start_u;
+            fall = spans.slope + (since + since) * spans.bend;
             first = first.max(spans.start_u);
             last = last.min(spans.end_u);
             let away =
@@ -175,6 +247,7 @@ impl Abreast<'_, '_> {
             // Turns -0 into 0, as adding the missing bend does.
             let slope = up + L::D::splat(0.0);
             z = L::D::splat(eye_z) + begin * slope;
+            fall = slope;
             if eye_z > sight.highest {
                 over = over & up.lt(L::D::splat(0.0));
             }
@@ -196,6 +269,69 @@ impl Abreast<'_, '_> {
         for lane in 0..L::N {
             let open = open >> lane & 1 == 1;
             self.rays.verdicts[at + lane] = if open { Verdict::Open } else { Verdict::Miss };
+        }
+        let start = Start { begin, last, rate, inverse, z, fall };
+        let mut approach = Approach::new(&sight, &start);
+        approach.active = approach.active & lanes;
+        approach
+    }
+
+    /// Tests the cells in which the approaches have ended; rays that meet nothing there are
+    /// left for the walk.
+    #[inline(always)]
+    fn touch_at<L: Lanes, const ROUND: bool>(&mut self, at: usize, cell: [L::I; 2], lanes: L::M) {
+        let sight = self.sight;
+        let mut walk = Walk::<L>::new();
+        walk.load::<ROUND>(self.rays, at, cell);
+        let begin = self.load::<L>(Part::U, at);
+        let lanes = lanes & begin.lt(walk.last);
+        if !lanes.any() {
+            return;
+        }
+        let u = begin.max(walk.entry(&sight));
+        let near = lanes & u.lt(walk.last);
+        let (hits, _, hit_u, hit_z) = walk.contacts::<ROUND>(&sight, self.tiles, near);
+        let left = lanes & !hits;
+        self.store::<L>(Part::U, at, L::D::select(hits, hit_u, L::D::select(near, u, begin)));
+        self.store::<L>(Part::Z, at, hit_z);
+        cell[0].store(&mut self.rays.cells[0][at..]);
+        cell[1].store(&mut self.rays.cells[1][at..]);
+        let hit = hits.bits();
+        for lane in 0..L::N {
+            let verdict = self.rays.verdicts[at + lane];
+            let verdict = if hit >> lane & 1 == 1 { Verdict::Hit } else { verdict };
+            self.rays.verdicts[at + lane] = verdict;
+        }
+        if left.any() {
+            self.leave::<L, ROUND>(at, walk, left, near);
+        }
+    }
+
+    /// Leaves rays for the walk.
+    #[inline(always)]
+    fn leave<L: Lanes, const ROUND: bool>(
+        &mut self,
+        at: usize,
+        mut walk: Walk<L>,
+        left: L::M,
+        near: L::M,
+    ) {
+        let sight = self.sight;
+        let u = self.load::<L>(Part::U, at);
+        // A course that ends on the way goes on in another: from its start on.
+        for axis in 0..2 {
+            let first = walk.cell_at(&sight, axis, u);
+            walk.cell[axis] = L::I::select(near, walk.cell[axis], first);
+        }
+        let z = walk.z::<ROUND>(&sight, u);
+        let z = L::D::select(left, z, self.load::<L>(Part::Z, at));
+        self.store::<L>(Part::Z, at, z);
+        self.store::<L>(Part::CellX, at, L::D::from_ints(walk.cell[0]));
+        self.store::<L>(Part::CellY, at, L::D::from_ints(walk.cell[1]));
+        let mut bits = left.bits();
+        while bits != 0 {
+            self.rest.take(self.rays, at + bits.trailing_zeros() as usize);
+            bits &= bits - 1;
         }
     }
 
@@ -235,8 +371,8 @@ impl Abreast<'_, '_> {
             left = false;
             for walk in &mut walks {
                 let idle = !walk.active;
-                if taken < self.rays.count && idle.count() as usize * IDLE_SHARE >= L::N {
-                    walk.refill::<ROUND>(&self.sight, self.rays, taken, idle);
+                if taken < self.rest.count && idle.count() as usize * IDLE_SHARE >= L::N {
+                    walk.refill::<ROUND>(self.rest, taken, idle);
                     taken += idle.count() as usize;
                 }
                 if walk.active.any() {
@@ -244,7 +380,7 @@ impl Abreast<'_, '_> {
                     left = true;
                 }
             }
-            left |= taken < self.rays.count;
+            left |= taken < self.rest.count;
         }
         steps
     }
@@ -296,7 +432,7 @@ impl Abreast<'_, '_> {
         let mut bits = hits.bits();
         while bits != 0 {
             let lane = bits.trailing_zeros() as usize % MOST;
-            let ray = numbers[lane] as usize;
+            let ray = self.rest.origins[numbers[lane] as usize] as usize;
             self.rays.part_mut(Part::U)[ray] = us[lane];
             self.rays.part_mut(Part::Z)[ray] = zs[lane];
             self.rays.cells[0][ray] = xs[lane];
@@ -313,7 +449,8 @@ impl Abreast<'_, '_> {
         walk.ray.store(&mut numbers);
         for (lane, &ray) in numbers.iter().enumerate().take(L::N) {
             if lanes.bits() >> lane & 1 == 1 {
-                self.rays.verdicts[ray as usize] = Verdict::Open;
+                let ray = self.rest.origins[ray as usize] as usize;
+                self.rays.verdicts[ray] = Verdict::Open;
             }
         }
     }

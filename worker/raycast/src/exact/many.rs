@@ -26,6 +26,8 @@ pub(crate) struct Many<'a> {
     abreast: Option<Layer<'a>>,
     cursor: Cursor<'a>,
     rays: Rays,
+    /// Those that are not done at once.
+    rest: Rays,
     /// What the slow caster found, by ray.
     outcomes: Vec<Outcome>,
     /// Blocks and cells looked at abreast.
@@ -56,6 +58,7 @@ impl<'a> Many<'a> {
             abreast: if fast { Layer::new(field, camera, &ground) } else { None },
             cursor: Cursor::new(field),
             rays: Rays::new(),
+            rest: Rays::new(),
             outcomes: vec![Outcome::Miss; MOST_RAYS],
             steps: 0,
         }
@@ -92,7 +95,8 @@ impl<'a> Many<'a> {
         let count = self.rays.count;
         match &mut self.abreast {
             Some(Layer { sight, tiles, .. }) => {
-                let abreast = Abreast { sight: *sight, tiles, rays: &mut self.rays };
+                let (rays, rest) = (&mut self.rays, &mut self.rest);
+                let abreast = Abreast { sight: *sight, tiles, rays, rest };
                 self.steps += lanes::run(abreast, self.width);
             }
             None => self.rays.verdicts[..count].fill(Verdict::Open),
@@ -210,6 +214,7 @@ impl<'a> Layer<'a> {
             scale,
             cells,
             highest: field.pyramid.highest(),
+            largest: field.pyramid.highest().abs().max(field.pyramid.lowest().abs()),
         };
         Some(Layer { number, sight, tiles: Tiles::new(field, number) })
     }

@@ -41,6 +41,9 @@ pub(super) enum Part {
     EndZ,
     Slope,
     Bend,
+    /// The cell in which the walk begins.
+    CellX,
+    CellY,
     /// One over the depth of the contact, per metre.
     InverseDepth,
 }
@@ -61,6 +64,8 @@ pub(super) struct Rays {
     parts: Vec<[f64; ROOM]>,
     pub(super) cells: [Vec<i32>; 2],
     pub(super) verdicts: Vec<Verdict>,
+    /// Of rays that were taken from another list: their numbers there.
+    pub(super) origins: Vec<u32>,
     pub(super) count: usize,
 }
 
@@ -69,9 +74,20 @@ impl Rays {
         Rays {
             parts: vec![[0.0; ROOM]; PARTS],
             cells: [vec![0; ROOM], vec![0; ROOM]],
+            origins: vec![0; ROOM],
             verdicts: vec![Verdict::Miss; ROOM],
             count: 0,
         }
+    }
+
+    /// Adds a ray of another list.
+    pub(super) fn take(&mut self, other: &Rays, ray: usize) {
+        let at = self.count;
+        for (part, others) in self.parts.iter_mut().zip(&other.parts) {
+            part[at] = others[ray];
+        }
+        self.origins[at] = ray as u32;
+        self.count = at + 1;
     }
 
     #[inline(always)]

@@ -32,11 +32,15 @@ fn more_lands() -> Vec<Land> {
             || (i / 256, j / 256) == (1, 0);
         if hole { f32::NAN } else { quarters(i, j) }
     };
+    let low = |i: u64, j: u64| 0.002 * noise(i, j, 3);
+    let high = |i: u64, j: u64| 3e6 + 1e5 * noise(i / 2, j, 3);
     let one = |plan| vec![plan];
     vec![
         Land::new("floats", one(Plan::heights([-40.0, 7.5], [1.0, 1.0], [601, 530], hills))),
         Land::new("codes", one(Plan::heights([1e6, -3e6], [10.0, 7.0], [530, 700], quarters))),
         Land::new("holes", one(Plan::heights([0.0; 2], [0.3, 0.4], [771, 300], holed))),
+        Land::new("tiny", one(Plan::heights([5e5, 5e6], [1e-3, 2e-3], [90, 300], low))),
+        Land::new("vast", one(Plan::heights([-7e6, 1e7], [9e4, 5e4], [300, 70], high))),
         Land::new("one cell", one(Plan::heights([0.0; 2], [5.0; 2], [2, 2], quarters))),
         Land::new(
             "rough",
@@ -50,7 +54,7 @@ fn camera(land: &Land, dice: &mut Dice) -> Camera {
     let layer = &land.resident.index().layers[0];
     let far = layer.far_corner();
     let (low, high) = (land.pyramid.lowest(), land.pyramid.highest());
-    let afar = [0.1, 0.1, 3.0][dice.below(3) as usize];
+    let afar = [0.1, 0.1, 3.0, 3e4][dice.below(4) as usize];
     let mut eye = [0.0; 2];
     for (axis, eye) in eye.iter_mut().enumerate() {
         let room = afar * (far[axis] - layer.origin[axis]);
@@ -61,6 +65,9 @@ fn camera(land: &Land, dice: &mut Dice) -> Camera {
         }
     }
     let over = [20.0, 400.0][dice.below(2) as usize];
+    // As high above the land as it is wide, or rather close to it.
+    let wide = far[0] - layer.origin[0];
+    let over = if dice.below(4) == 0 { wide.max(layer.spacing[0]) } else { over };
     let z = dice.between(low - 5.0, high + over);
     let pitch = [-90.0, 0.0, dice.between(-90.0, 30.0), dice.between(-20.0, 5.0)];
     let pitch = pitch[dice.below(4) as usize];
@@ -134,7 +141,7 @@ fn every_width_finds_the_same_bits_as_the_slow_twin() {
         }
     }
     println!("{hits} hits, {misses} misses: all the same");
-    assert!(hits > 100_000 && misses > 50_000, "{hits} hits, {misses} misses");
+    assert!(hits > 50_000 && misses > 50_000, "{hits} hits, {misses} misses");
 }
 
 #[test]

@@ -50,6 +50,59 @@ pub(super) struct Corners<L: Lanes> {
     pub absent: L::M,
 }
 
+/// The ground as f32 tells it: each height within four roundings.
+pub(super) struct Rough<L: Lanes> {
+    /// Of blocks: -infinity where no cell has a surface.
+    pub highest: L::F,
+    /// The corners of cells, in the order of [`Corners`].
+    pub heights: [L::F; 4],
+    /// The cells that have a surface.
+    pub solid: L::M,
+    /// The lanes whose tile is not loaded.
+    pub absent: L::M,
+}
+
+impl<L: Lanes> Rough<L> {
+    #[inline(always)]
+    fn none() -> Self {
+        Rough {
+            highest: L::F::splat(f32::NEG_INFINITY),
+            heights: [L::F::splat(0.0); 4],
+            solid: L::M::none(),
+            absent: L::M::none(),
+        }
+    }
+
+    #[inline(always)]
+    fn read_codes(&mut self, codes: &Codes, at: L::I, lanes: L::M) {
+        let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
+        let south = L::I::gather_pairs(codes.posts, at, lanes);
+        let north = L::I::gather_pairs(codes.posts, at + L::I::splat(TILE_POSTS as i32), lanes);
+        let read = [south & low, south.shr(sixteen) & low, north & low, north.shr(sixteen) & low];
+        let highest = read[0].max(read[1]).max(read[2].max(read[3]));
+        self.solid = self.solid | (lanes & highest.lt(L::I::splat(i32::from(VOID))));
+        for n in 0..4 {
+            let height = rough_heights::<L>(codes, read[n]);
+            self.heights[n] = L::F::select(lanes, height, self.heights[n]);
+        }
+    }
+
+    #[inline(always)]
+    fn read_floats(&mut self, posts: &[u32], at: L::I, lanes: L::M) {
+        let south = L::I::gather_twos(posts, at, lanes);
+        let north = L::I::gather_twos(posts, at + L::I::splat(TILE_POSTS as i32), lanes);
+        let read = [south.0, south.1, north.0, north.1];
+        let mut solid = lanes;
+        for n in 0..4 {
+            let height = L::F::from_bits(read[n]);
+            // A void is NaN.
+            solid = solid & height.eq(height);
+            self.heights[n] = L::F::select(lanes, height, self.heights[n]);
+        }
+        self.solid = self.solid | solid;
+    }
+}
+
 impl<'a> Tiles<'a> {
     pub(crate) fn new(field: Field<'a>, layer: usize) -> Self {
         let levels = &field.index().layers[layer].levels;
@@ -145,6 +198,64 @@ impl<'a> Tiles<'a> {
         (highest, absent)
     }
 
+    /// What f32 can tell of the corners of cells.
+    #[inline(always)]
+    pub(super) fn rough_corners<L: Lanes>(&mut self, cell: [L::I; 2], lanes: L::M) -> Rough<L> {
+        let at = post::<L>(cell);
+        let numbers = self.numbers::<L>(cell);
+        let mut rough = Rough::none();
+        let mut rest = lanes;
+        while rest.any() {
+            let here = self.alike::<L>(numbers, rest);
+            match self.last.1 {
+                Soil::Codes(codes) => rough.read_codes(&codes, at, here),
+                Soil::Floats { posts, .. } => rough.read_floats(posts, at, here),
+                Soil::Void => {}
+                Soil::Absent { .. } => rough.absent = rough.absent | here,
+            }
+            rest = rest & !here;
+        }
+        rough
+    }
+
+    /// What f32 can tell of the ground: the maxima of `blocks` and the corners of `cells`.
+    #[inline(always)]
+    pub(super) fn rough<L: Lanes>(
+        &mut self,
+        cell: [L::I; 2],
+        level: L::I,
+        blocks: L::M,
+        cells: L::M,
+    ) -> Rough<L> {
+        let at = maximum::<L>([cell[0].shr(level), cell[1].shr(level)], level);
+        let corner = post::<L>(cell);
+        let numbers = self.numbers::<L>(cell);
+        let mut rough = Rough::none();
+        let mut rest = blocks | cells;
+        while rest.any() {
+            let here = self.alike::<L>(numbers, rest);
+            match self.last.1 {
+                Soil::Codes(codes) => {
+                    let code = L::I::gather_pairs(codes.maxima, at, here & blocks);
+                    let code = code & L::I::splat(0xFFFF);
+                    let any = here & blocks & !code.eq(L::I::splat(0));
+                    let highest = rough_heights::<L>(&codes, code);
+                    rough.highest = L::F::select(any, highest, rough.highest);
+                    rough.read_codes(&codes, corner, here & cells);
+                }
+                Soil::Floats { posts, maxima } => {
+                    let read = L::F::from_bits(L::I::gather(maxima, at, here & blocks));
+                    rough.highest = L::F::select(here & blocks, read, rough.highest);
+                    rough.read_floats(posts, corner, here & cells);
+                }
+                Soil::Void => {}
+                Soil::Absent { .. } => rough.absent = rough.absent | here,
+            }
+            rest = rest & !here;
+        }
+        rough
+    }
+
     /// The corners of cells, for `lanes`.
     #[inline(always)]
     pub(super) fn corners<L: Lanes>(&mut self, cell: [L::I; 2], lanes: L::M) -> Corners<L> {
@@ -198,6 +309,12 @@ impl<'a> Tiles<'a> {
         }
         corners
     }
+}
+
+/// Heights of codes, metres, within four roundings.
+#[inline(always)]
+fn rough_heights<L: Lanes>(codes: &Codes, code: L::I) -> L::F {
+    (L::I::splat(codes.base) + code).to_floats() * L::F::splat(codes.step as f32)
 }
 
 /// Heights of codes, metres: what the tile gives back for each, to the bit.

@@ -8,10 +8,6 @@ use crate::exact::tiles::Tiles;
 use crate::lanes::{Doubles, Ints, Lanes, MOST, Mask};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
-/// Level at which a walk begins. Measured with `examples/bench.rs`: beams end closer to
-/// the ground than a block of 2 is high.
-const FIRST_LEVEL: i32 = 1;
-
 /// Lanes on their way.
 pub(super) struct Walk<L: Lanes> {
     /// Those that are not done.
@@ -77,15 +73,42 @@ impl<L: Lanes> Walk<L> {
         }
     }
 
+    /// Puts all lanes into cells of the rays from `at` on.
+    #[inline(always)]
+    pub(super) fn load<const ROUND: bool>(&mut self, rays: &Rays, at: usize, cell: [L::I; 2]) {
+        self.rate[0] = L::D::load(&rays.part(Part::RateX)[at..]);
+        self.rate[1] = L::D::load(&rays.part(Part::RateY)[at..]);
+        self.inverse[0] = L::D::load(&rays.part(Part::InverseX)[at..]);
+        self.inverse[1] = L::D::load(&rays.part(Part::InverseY)[at..]);
+        self.first = L::D::load(&rays.part(Part::First)[at..]);
+        self.last = L::D::load(&rays.part(Part::Last)[at..]);
+        self.spans.slope = L::D::load(&rays.part(Part::Slope)[at..]);
+        if ROUND {
+            self.spans.start_u = L::D::load(&rays.part(Part::StartU)[at..]);
+            self.spans.end_u = L::D::load(&rays.part(Part::EndU)[at..]);
+            self.spans.start_z = L::D::load(&rays.part(Part::StartZ)[at..]);
+            self.spans.end_z = L::D::load(&rays.part(Part::EndZ)[at..]);
+            self.spans.bend = L::D::load(&rays.part(Part::Bend)[at..]);
+        }
+        for axis in 0..2 {
+            let forward = L::D::splat(0.0).lt(self.rate[axis]);
+            self.ahead[axis] = L::I::select(forward, L::I::splat(1), L::I::splat(0));
+            self.cell[axis] = cell[axis];
+        }
+    }
+
+    /// Where the rays enter their cells.
+    #[inline(always)]
+    pub(super) fn entry(&self, sight: &Sight) -> L::D {
+        let one = L::I::splat(1);
+        let x = self.line_u(sight, 0, self.cell[0] + one - self.ahead[0]);
+        let y = self.line_u(sight, 1, self.cell[1] + one - self.ahead[1]);
+        x.max(y)
+    }
+
     /// Puts lanes at the start of the rays from `at` on.
     #[inline(always)]
-    pub(super) fn refill<const ROUND: bool>(
-        &mut self,
-        sight: &Sight,
-        rays: &Rays,
-        at: usize,
-        lanes: L::M,
-    ) {
+    pub(super) fn refill<const ROUND: bool>(&mut self, rays: &Rays, at: usize, lanes: L::M) {
         self.u = self.u.refill(&rays.part(Part::U)[at..], lanes);
         self.z = self.z.refill(&rays.part(Part::Z)[at..], lanes);
         self.rate[0] = self.rate[0].refill(&rays.part(Part::RateX)[at..], lanes);
@@ -117,12 +140,13 @@ impl<L: Lanes> Walk<L> {
         };
         let number = L::D::splat(0.0).refill(&RANKS, lanes).truncate() + L::I::splat(at as i32);
         self.ray = L::I::select(lanes, number, self.ray);
-        self.level = L::I::select(lanes, L::I::splat(FIRST_LEVEL), self.level);
         let zero = L::I::splat(0);
+        self.level = L::I::select(lanes, zero, self.level);
         for axis in 0..2 {
             let forward = L::D::splat(0.0).lt(self.rate[axis]);
             self.ahead[axis] = L::I::select(forward, L::I::splat(1), zero);
-            let cell = self.cell_at(sight, axis, self.u);
+            let part = [Part::CellX, Part::CellY][axis];
+            let cell = L::D::splat(0.0).refill(&rays.part(part)[at..], lanes).truncate();
             self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
         }
         self.active = self.active | (lanes & self.u.lt(self.last));
@@ -130,7 +154,7 @@ impl<L: Lanes> Walk<L> {
 
     /// The cell of an axis in which the rays are at `u`, or the one before.
     #[inline(always)]
-    fn cell_at(&self, sight: &Sight, axis: usize, u: L::D) -> L::I {
+    pub(super) fn cell_at(&self, sight: &Sight, axis: usize, u: L::D) -> L::I {
         cell_at::<L>(
             L::D::splat(sight.start[axis]) + u * self.rate[axis],
             L::D::splat(sight.slack[axis]),
@@ -141,7 +165,7 @@ impl<L: Lanes> Walk<L> {
 
     /// Heights of the rays at `u`.
     #[inline(always)]
-    fn z<const ROUND: bool>(&self, sight: &Sight, u: L::D) -> L::D {
+    pub(super) fn z<const ROUND: bool>(&self, sight: &Sight, u: L::D) -> L::D {
         if ROUND {
             self.spans.z(u)
         } else {
@@ -374,7 +398,7 @@ fn lerp<L: Lanes>(a: L::D, b: L::D, t: L::D) -> L::D {
 /// rounding adds. A cell too early is left in the next step; one too late would leave
 /// ground out.
 #[inline(always)]
-fn cell_at<L: Lanes>(position: L::D, slack: L::D, ahead: L::M, last: L::I) -> L::I {
+pub(super) fn cell_at<L: Lanes>(position: L::D, slack: L::D, ahead: L::M, last: L::I) -> L::I {
     let behind = L::D::select(ahead, position - slack, position + slack);
     behind.truncate().max(L::I::splat(0)).min(last)
 }

@@ -200,4 +200,12 @@ impl Doubles for D {
             D(_mm256_cvtps_pd(_mm256_cvtpd_ps(self.0)), _mm256_cvtps_pd(_mm256_cvtpd_ps(self.1)))
         }
     }
+    #[inline(always)]
+    fn to_floats(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe {
+            let low = _mm256_castps128_ps256(_mm256_cvtpd_ps(self.0));
+            F(_mm256_insertf128_ps::<1>(low, _mm256_cvtpd_ps(self.1)))
+        }
+    }
 }

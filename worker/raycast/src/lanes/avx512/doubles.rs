@@ -160,4 +160,12 @@ impl Doubles for D {
             D(_mm512_cvtps_pd(_mm512_cvtpd_ps(self.0)), _mm512_cvtps_pd(_mm512_cvtpd_ps(self.1)))
         }
     }
+    #[inline(always)]
+    fn to_floats(self) -> F {
+        // SAFETY: see the page of this module.
+        unsafe {
+            let low = _mm512_castps256_ps512(_mm512_cvtpd_ps(self.0));
+            F(_mm512_insertf32x8::<1>(low, _mm512_cvtpd_ps(self.1)))
+        }
+    }
 }

@@ -100,4 +100,8 @@ impl Doubles for D {
     fn to_single(self) -> D {
         D(f64::from(self.0 as f32))
     }
+    #[inline(always)]
+    fn to_floats(self) -> F {
+        F(self.0 as f32)
+    }
 }

@@ -1,0 +1,246 @@
+//! The way of rays up to where f64 must tell: over cells and blocks, in f32.
+//!
+//! It decides nothing: an approach ends in the first cell that the ray is not seen to
+//! clear, and what is done in f64 begins there.
+//!
+//! **What is to be shown.** The approach leaves cells behind. The rest may begin where the
+//! ray enters the last cell, if the ray goes through just these cells, in the twin's order,
+//! and meets nothing in any of those left behind.
+//!
+//! **Places.** With the ray's larger rate as the unit, `v` counts cells along that axis
+//! from the start. Positions are `from + v rate`, relative to the first cell, with
+//! `|rate| <= 1`, `from` in [0, 1] and `v <= FARTHEST`; lines are crossed at
+//! `v = (line - from) inverse`. `from` rounds by at most 2^-24 cells. The difference, `inverse`
+//! and their product, `rate`, its product with v and the sum round once each, by at most
+//! 2^-24 of something that is no larger than `FARTHEST + 1` cells: together less than
+//! [`BLUR`]. The twin's own rounding is below [`SURE_SLACK`], a thousandth of that; else
+//! there is no approach.
+//!
+//! **The same cells.** A crossing is off by at most `BLUR` across its line, hence by
+//! `BLUR |inverse|` in v, and its place along the line by `doubt = BLUR (1 + |inverse|)`. A
+//! block is left by the line that is crossed first; where that place is further than
+//! `doubt` from every line across it, the ray crosses between the same two lines, and
+//! enters the same cell. Where it is not, the approach ends.
+//!
+//! **Nothing is met in a block.** The ray's height is replaced by its tangent at the start,
+//! which is nowhere above it within a span (`path`), but for rounding. So in a block it is at least
+//! the lesser of those at both ends; these are off by up to `doubt` in v, so
+//! `doubt |slope|` is taken off.
+//!
+//! **Nor in a cell.** There the height of the tangent above the surface is a parabola,
+//! which hangs below the line through its ends by a quarter of its bend at most. Places
+//! are off by `doubt` along each axis, the ends by as much again, and the surface is no
+//! steeper than the cell's range of heights for each cell: that is six times
+//! `doubt range`; eight are asked for.
+//!
+//! **Heights.** Those of posts round four times, the ray's and the surface's and what is
+//! made of them less than twenty times, by 2^-24 of twice the largest height. [`ROUGHNESS`]
+//! is 64 times 2^-24; it is taken off at the start, with the twin's own clearance.
+//!
+//! What overflows becomes infinite or NaN, which clears nothing.
+
+use super::walk::cell_at;
+use super::{Sight, Start};
+use crate::exact::CLEARANCE_M;
+use crate::exact::tiles::{Rough, Tiles};
+use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
+use terrafarm_terrain::tile::MAXIMA_LEVELS;
+
+/// The longest approach, cells along the axis of the larger rate.
+pub(super) const FARTHEST: f64 = 250.0;
+/// Bound of all rounding in positions, cells: more than 6 x 251 x 2^-24.
+const BLUR: f32 = 1.0 / 8192.0;
+/// Bound of the twin's own rounding, cells.
+pub(super) const SURE_SLACK: f64 = 1.0 / (1 << 22) as f64;
+/// Share by which heights may differ in f32, that of the ray and those of posts together.
+const ROUGHNESS: f64 = 1.0 / (1 << 18) as f64;
+/// The steepest slope, metres a cell along the axis of the larger rate: far from what
+/// overflows.
+const STEEPEST: f32 = 1e30;
+
+/// Lanes on their way.
+pub(super) struct Approach<L: Lanes> {
+    pub(super) active: L::M,
+    /// The cell in which the ray began.
+    base: [L::I; 2],
+    pub(super) cell: [L::I; 2],
+    level: L::I,
+    /// How far the ray has come ...
+    v: L::F,
+    /// ... and a bound of its height there.
+    low: L::F,
+    from: [L::F; 2],
+    rate: [L::F; 2],
+    inverse: [L::F; 2],
+    ahead: [L::I; 2],
+    /// Within which crossings of the lines of an axis are known, along them.
+    doubt: [L::F; 2],
+    height: L::F,
+    slope: L::F,
+    reach: L::F,
+}
+
+/// Where lanes leave their blocks.
+struct Exits<L: Lanes> {
+    lines: [L::I; 2],
+    v: L::F,
+    low: L::F,
+    doubt: L::F,
+    north: L::M,
+}
+
+impl<L: Lanes> Approach<L> {
+    /// Rays at the start of their approach.
+    #[inline(always)]
+    pub(super) fn new(sight: &Sight, start: &Start<L>) -> Self {
+        let Start { begin, last, rate, inverse, z, fall } = *start;
+        let along = inverse[0].abs().min(inverse[1].abs());
+        let pace = rate[0].abs().max(rate[1].abs());
+        let slope = (fall * along).to_floats();
+        let reach = ((last - begin) * pace).min(L::D::splat(FARTHEST)).to_floats();
+        let may = begin.lt(last) & slope.abs().lt(L::F::splat(STEEPEST));
+        let sure = sight.slack[0].max(sight.slack[1]) < SURE_SLACK;
+        let size = z.abs() + L::D::splat(sight.largest);
+        let room = L::D::splat(CLEARANCE_M) + L::D::splat(ROUGHNESS) * size;
+        let low = (z - room).to_floats();
+        let (none, zero) = (L::F::splat(0.0), L::I::splat(0));
+        let mut approach = Approach {
+            active: if sure { may } else { L::M::none() },
+            base: [zero; 2],
+            cell: [zero; 2],
+            level: zero,
+            v: none,
+            low,
+            from: [none; 2],
+            rate: [none; 2],
+            inverse: [none; 2],
+            ahead: [zero; 2],
+            doubt: [none; 2],
+            height: low,
+            slope,
+            reach,
+        };
+        for axis in 0..2 {
+            let position = L::D::splat(sight.start[axis]) + begin * rate[axis];
+            let slack = L::D::splat(sight.slack[axis]);
+            let ahead = L::D::splat(0.0).lt(rate[axis]);
+            let last = L::I::splat(sight.cells[axis] - 1);
+            let cell = cell_at::<L>(position, slack, ahead, last);
+            let inverse = (inverse[axis] * pace).to_floats();
+            approach.base[axis] = cell;
+            approach.cell[axis] = cell;
+            approach.from[axis] = (position - L::D::from_ints(cell)).to_floats();
+            approach.rate[axis] = (rate[axis] * along).to_floats();
+            approach.inverse[axis] = inverse;
+            approach.ahead[axis] = L::I::select(ahead, L::I::splat(1), zero);
+            approach.doubt[axis] = L::F::splat(BLUR) * (L::F::splat(1.0) + inverse.abs());
+        }
+        approach
+    }
+
+    /// Where the rays leave the blocks that they are in, by one of two lines.
+    #[inline(always)]
+    fn exits(&self, lines: [L::I; 2]) -> Exits<L> {
+        let x = ((lines[0] - self.base[0]).to_floats() - self.from[0]) * self.inverse[0];
+        let y = ((lines[1] - self.base[1]).to_floats() - self.from[1]) * self.inverse[1];
+        let north = y.lt(x);
+        let v = y.min(x);
+        let doubt = L::F::select(north, self.doubt[1], self.doubt[0]);
+        let low = self.height + v * self.slope - doubt * self.slope.abs();
+        Exits { lines, v, low, doubt, north }
+    }
+
+    /// Takes lanes, all of which are at a cell, a step further. Returns how many.
+    #[inline(always)]
+    pub(super) fn step_cells(&mut self, sight: &Sight, tiles: &mut Tiles) -> u64 {
+        let taken = self.active;
+        let lines = [self.cell[0] + self.ahead[0], self.cell[1] + self.ahead[1]];
+        let exits = self.exits(lines);
+        let rough = tiles.rough_corners::<L>(self.cell, taken);
+        let clear = (self.misses(&rough, &exits) | !rough.solid) & !rough.absent;
+        self.active = self.pass(sight, &exits, taken & clear);
+        u64::from(taken.count())
+    }
+
+    /// Takes lanes, at blocks and cells, a step further. Returns how many.
+    #[inline(always)]
+    pub(super) fn step(&mut self, sight: &Sight, tiles: &mut Tiles) -> u64 {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let taken = self.active;
+        let cells = taken & self.level.eq(zero);
+        let blocks = taken & !cells;
+        let lines = [
+            (self.cell[0].shr(self.level) + self.ahead[0]).shl(self.level),
+            (self.cell[1].shr(self.level) + self.ahead[1]).shl(self.level),
+        ];
+        let exits = self.exits(lines);
+        let rough = tiles.rough::<L>(self.cell, self.level, blocks, cells);
+        let passed = rough.highest.lt(self.low.min(exits.low));
+        let missed = self.misses(&rough, &exits) | !rough.solid;
+        let clear = ((blocks & passed) | (cells & missed)) & !rough.absent;
+        let down = blocks & !clear & !rough.absent;
+        self.level = L::I::select(down, self.level - one, self.level);
+        let before = self.cell;
+        let moved = self.pass(sight, &exits, clear);
+        let parent = self.level + one;
+        let same_x = before[0].shr(parent).eq(self.cell[0].shr(parent));
+        let same_y = before[1].shr(parent).eq(self.cell[1].shr(parent));
+        let up = moved & !(same_x & same_y) & self.level.lt(L::I::splat(MAXIMA_LEVELS as i32));
+        self.level = L::I::select(up, parent, self.level);
+        self.active = down | moved;
+        u64::from(taken.count())
+    }
+
+    /// Which lanes are seen to be above the surface all through their cells.
+    #[inline(always)]
+    fn misses(&self, rough: &Rough<L>, exits: &Exits<L>) -> L::M {
+        let [sw, se, nw, ne] = rough.heights;
+        let zero = L::F::splat(0.0);
+        let (x, y) =
+            ((self.cell[0] - self.base[0]).to_floats(), (self.cell[1] - self.base[1]).to_floats());
+        let (from_x, from_y) = (self.from[0] - x, self.from[1] - y);
+        let (south, north) = (se - sw, ne - nw);
+        let x0 = from_x + self.v * self.rate[0];
+        let y0 = from_y + self.v * self.rate[1];
+        let x1 = from_x + exits.v * self.rate[0];
+        let y1 = from_y + exits.v * self.rate[1];
+        let (start_s, start_n) = (sw + south * x0, nw + north * x0);
+        let (end_s, end_n) = (sw + south * x1, nw + north * x1);
+        let start = start_s + (start_n - start_s) * y0;
+        let end = end_s + (end_n - end_s) * y1;
+        let curl = (north - south) * (x1 - x0) * (y1 - y0);
+        let sag = L::F::splat(0.25) * (zero - curl).max(zero);
+        let range = sw.max(se).max(nw.max(ne)) - sw.min(se).min(nw.min(ne));
+        let doubt = self.doubt[0].max(self.doubt[1]);
+        let room = sag + L::F::splat(8.0) * doubt * range;
+        let least = (self.low - start).min(exits.low - end);
+        room.lt(least)
+    }
+
+    /// Goes on behind blocks; returns the lanes that may.
+    #[inline(always)]
+    fn pass(&mut self, sight: &Sight, exits: &Exits<L>, lanes: L::M) -> L::M {
+        let (zero, one) = (L::I::splat(0), L::I::splat(1));
+        let north = exits.north;
+        let line = L::I::select(north, exits.lines[1], exits.lines[0]);
+        let after = line - one + L::I::select(north, self.ahead[1], self.ahead[0]);
+        let (columns, rows) = (L::I::splat(sight.cells[0]), L::I::splat(sight.cells[1]));
+        let counts = L::I::select(north, rows, columns);
+        let outside = after.lt(zero) | !after.lt(counts);
+        // Where along the line, in cells.
+        let from = L::F::select(north, self.from[0], self.from[1]);
+        let rate = L::F::select(north, self.rate[0], self.rate[1]);
+        let place = from + exits.v * rate;
+        let floor = place.floor();
+        let part = place - floor.to_floats();
+        let sure = exits.doubt.lt(part) & part.lt(L::F::splat(1.0) - exits.doubt);
+        let near = exits.v.lt(self.reach);
+        let beside = floor + L::I::select(north, self.base[0], self.base[1]);
+        let moving = lanes & sure & near & !outside;
+        self.v = L::F::select(moving, exits.v, self.v);
+        self.low = L::F::select(moving, exits.low, self.low);
+        self.cell[0] = L::I::select(moving, L::I::select(north, beside, after), self.cell[0]);
+        self.cell[1] = L::I::select(moving, L::I::select(north, after, beside), self.cell[1]);
+        moving
+    }
+}
