@@ -24,7 +24,7 @@ use crate::{Pyramid, View};
 pub(crate) use batch::{At, Far, Places};
 
 use air::Air;
-use batch::{AT_ONCE, Batch, Canvas};
+use batch::{Batch, Canvas, Each};
 use footprint::{Footprint, steepness};
 use glam::DVec3;
 use photo::Sums;
@@ -140,7 +140,7 @@ impl<'a> Shader<'a> {
         lanes::run(Run { shader: self, places, canvas }, width);
     }
 
-    /// Shades [`AT_ONCE`] places at most. Every step is done for all of them before the
+    /// Shades the places of a batch. Every step is done for all of them before the
     /// next is: within a step nothing waits for anything, while the steps of one place are
     /// a long chain.
     #[inline(always)]
@@ -188,7 +188,7 @@ impl<'a> Shader<'a> {
     /// Slopes of the ground: each place's by the uppermost layer that is there.
     #[inline(always)]
     fn slopes<L: Lanes>(&mut self, batch: &mut Batch, vectors: usize) {
-        batch.slopes = [[0.0; AT_ONCE]; 2];
+        batch.slopes = [Each::new(0.0); 2];
         let mut left = batch.ground;
         for (number, sheets) in self.heights.iter_mut().enumerate().rev() {
             for n in 0..vectors {
@@ -228,8 +228,8 @@ impl<'a> Shader<'a> {
             let at = n * L::N;
             steepness::<L>(batch.slopes::<L>(at)).store(&mut batch.steepness[at..]);
         }
-        batch.light = [[0.0; AT_ONCE]; 3];
-        batch.covered = [0.0; AT_ONCE];
+        batch.light = [Each::new(0.0); 3];
+        batch.covered = Each::new(0.0);
         let sides = [self.lens.right, self.lens.up];
         for sheets in self.photos.iter_mut().rev() {
             for n in 0..vectors {

@@ -307,17 +307,22 @@ unsafe fn gather_eights<const SIZE: usize>(table: *const u8, at: I, last: i32, m
     unsafe { eights::<SIZE>(table, &places(at, last), mask) }
 }
 
+/// Indices in memory, in one line of the cache.
+#[repr(align(64))]
+struct Indices([u32; 16]);
+
 /// Indices, brought inside a table.
 ///
 /// # Safety
 /// As every block here.
 #[inline(always)]
-unsafe fn places(at: I, last: i32) -> [u32; 16] {
-    let mut places = [0u32; 16];
-    // SAFETY: by this function's own condition.
+unsafe fn places(at: I, last: i32) -> Indices {
+    let mut places = Indices([0; 16]);
+    // SAFETY: by this function's own condition; they are aligned as a vector is.
     unsafe {
         let at = _mm512_min_epu32(at.0, _mm512_set1_epi32(last));
-        _mm512_storeu_si512(places.as_mut_ptr().cast(), at);
+        // Otherwise the compiler would take the vector apart and store each by itself.
+        std::ptr::from_mut(&mut places).cast::<__m512i>().write_volatile(at);
     }
     places
 }
@@ -327,7 +332,7 @@ unsafe fn places(at: I, last: i32) -> [u32; 16] {
 /// # Safety
 /// As every block here; and eight bytes from each place on must be readable.
 #[inline(always)]
-unsafe fn eights<const SIZE: usize>(table: *const u8, places: &[u32; 16], mask: M) -> (I, I) {
+unsafe fn eights<const SIZE: usize>(table: *const u8, places: &Indices, mask: M) -> (I, I) {
     // SAFETY: by this function's own condition.
     unsafe {
         let first = _mm512_inserti64x4::<1>(
@@ -349,9 +354,9 @@ unsafe fn eights<const SIZE: usize>(table: *const u8, places: &[u32; 16], mask: 
 
 /// A place, read from memory: taking it out of a vector costs more.
 #[inline(always)]
-fn place(places: &[u32; 16], n: usize) -> usize {
+fn place(places: &Indices, n: usize) -> usize {
     // SAFETY: a reference may be read from.
-    unsafe { std::ptr::from_ref(&places[n]).read_volatile() as usize }
+    unsafe { std::ptr::from_ref(&places.0[n]).read_volatile() as usize }
 }
 
 /// Eight bytes each from four places of a table, from the `n`th on.
@@ -359,11 +364,7 @@ fn place(places: &[u32; 16], n: usize) -> usize {
 /// # Safety
 /// As above: eight bytes at each place must be readable.
 #[inline(always)]
-unsafe fn four_eights<const SIZE: usize>(
-    table: *const u8,
-    places: &[u32; 16],
-    n: usize,
-) -> __m256i {
+unsafe fn four_eights<const SIZE: usize>(table: *const u8, places: &Indices, n: usize) -> __m256i {
     // SAFETY: by this function's own condition.
     unsafe {
         let a = table.add(place(places, n) * SIZE).cast::<i64>().read_unaligned();

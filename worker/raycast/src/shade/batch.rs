@@ -4,6 +4,7 @@ use super::photo::Rows;
 use super::slope::Cells;
 use crate::lanes::{Floats, Lanes, MOST};
 use crate::srgb;
+use std::ops::{Deref, DerefMut};
 
 /// Places of the picture, and how far away the ground is that is seen there.
 #[derive(Clone, Copy)]
@@ -43,34 +44,60 @@ pub(super) const AT_ONCE: usize = 128;
 /// Vectors of them, at most.
 pub(super) const VECTORS: usize = AT_ONCE;
 
+/// One value a place. No vector of them crosses a line of the cache.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+pub(super) struct Each<T>([T; AT_ONCE]);
+
+impl<T: Copy> Each<T> {
+    pub(super) fn new(value: T) -> Self {
+        Each([value; AT_ONCE])
+    }
+}
+
+impl<T> Deref for Each<T> {
+    type Target = [T; AT_ONCE];
+    #[inline(always)]
+    fn deref(&self) -> &[T; AT_ONCE] {
+        &self.0
+    }
+}
+
+impl<T> DerefMut for Each<T> {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut [T; AT_ONCE] {
+        &mut self.0
+    }
+}
+
 /// Some places on their way from step to step. Masks are bits, one word a vector.
 pub(super) struct Batch {
     pub(super) count: usize,
-    pub(super) x: [f32; AT_ONCE],
-    pub(super) y: [f32; AT_ONCE],
-    pub(super) far: [f32; AT_ONCE],
+    pub(super) x: Each<f32>,
+    pub(super) y: Each<f32>,
+    pub(super) far: Each<f32>,
     /// It is one over the depth.
     pub(super) inverse: bool,
     pub(super) ground: [u32; VECTORS],
     pub(super) sky: [u32; VECTORS],
     pub(super) unsure: [u32; VECTORS],
-    pub(super) view: [[f32; AT_ONCE]; 3],
-    pub(super) along: [[f32; AT_ONCE]; 2],
-    pub(super) over: [f32; AT_ONCE],
-    pub(super) distance: [f32; AT_ONCE],
-    pub(super) falls: [f32; AT_ONCE],
-    pub(super) size: [f32; AT_ONCE],
-    pub(super) slopes: [[f32; AT_ONCE]; 2],
-    pub(super) steepness: [f32; AT_ONCE],
-    pub(super) light: [[f32; AT_ONCE]; 3],
-    pub(super) covered: [f32; AT_ONCE],
+    pub(super) view: [Each<f32>; 3],
+    pub(super) along: [Each<f32>; 2],
+    pub(super) over: Each<f32>,
+    pub(super) distance: Each<f32>,
+    pub(super) falls: Each<f32>,
+    pub(super) size: Each<f32>,
+    pub(super) slopes: [Each<f32>; 2],
+    pub(super) steepness: Each<f32>,
+    pub(super) light: [Each<f32>; 3],
+    pub(super) covered: Each<f32>,
     pub(super) cells: Cells,
     pub(super) rows: Rows,
 }
 
 impl Batch {
     pub(super) fn new() -> Self {
-        let none = [0.0; AT_ONCE];
+        let none = Each::new(0.0);
         Batch {
             count: 0,
             x: none,

@@ -13,7 +13,7 @@
 //! chain of roots and quotients, and reading it is a loop of a length that the processor
 //! cannot foresee. One after the other for each place, either would wait for the other.
 
-use super::batch::{AT_ONCE, VECTORS};
+use super::batch::{Each, VECTORS};
 use super::footprint::{Footprint, Strip};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
@@ -37,36 +37,36 @@ const RIM: f32 = 0.5;
 pub(crate) struct Rows {
     /// Those that see the photo, and of these the ones for which a tile was missing.
     lanes: [u32; VECTORS],
-    cell: [[i32; AT_ONCE]; 2],
-    part: [[f32; AT_ONCE]; 2],
+    cell: [Each<i32>; 2],
+    part: [Each<f32>; 2],
     /// The strip.
     along_x: [u32; VECTORS],
-    slant: [f32; AT_ONCE],
-    extent: [f32; AT_ONCE],
+    slant: Each<f32>,
+    extent: Each<f32>,
     /// The finer level, the share of the coarser one, and what the photos above leave.
-    level: [i32; AT_ONCE],
-    coarser: [f32; AT_ONCE],
-    uncovered: [f32; AT_ONCE],
-    /// The rows that are to be read, and those of them that lie in one tile as a whole.
+    level: Each<i32>,
+    coarser: Each<f32>,
+    uncovered: Each<f32>,
+    /// The rows that are to be read, and those of them that one tile has as a whole.
     wanted: [u32; VECTORS],
     inside: [u32; VECTORS],
     /// Of the latter: the tile, the first texel in it were it not for the slant, and how
     /// far across from there it is at the middle.
-    number: [i32; AT_ONCE],
-    first: [i32; AT_ONCE],
-    side: [f32; AT_ONCE],
+    number: Each<i32>,
+    first: Each<i32>,
+    side: Each<f32>,
     /// See [`Track`].
-    begin: [f32; AT_ONCE],
-    start: [f32; AT_ONCE],
-    stop: [f32; AT_ONCE],
-    scale: [f32; AT_ONCE],
+    begin: Each<f32>,
+    start: Each<f32>,
+    stop: Each<f32>,
+    scale: Each<f32>,
 }
 
 /// What is summed up over the photos: light in squares of the texels' steps, premultiplied
 /// by coverage; see [`light`].
 pub(crate) struct Sums<'b> {
-    pub light: &'b mut [[f32; AT_ONCE]; 3],
-    pub coverage: &'b mut [f32; AT_ONCE],
+    pub light: &'b mut [Each<f32>; 3],
+    pub coverage: &'b mut Each<f32>,
     /// Places for which a tile was missing.
     pub unsure: &'b mut [u32; VECTORS],
 }
@@ -84,7 +84,7 @@ pub(crate) fn light<L: Lanes>(sum: [L::F; 3]) -> [L::F; 3] {
 
 impl Rows {
     pub(crate) fn new() -> Self {
-        let (none, zero) = ([0.0; AT_ONCE], [0; AT_ONCE]);
+        let (none, zero) = (Each::new(0.0), Each::new(0));
         Rows {
             lanes: [0; VECTORS],
             cell: [zero; 2],
@@ -173,29 +173,30 @@ impl Rows {
         let track = Track::new(&row, &grid, share);
         let none = L::I::splat(0);
         let bits = L::I::splat(TILE_BITS);
-        let (begin, end) = (track.start.floor(), track.stop.floor());
-        let (low, high) = (row.cell[0] + begin, row.cell[0] + end);
-        let (one_end, _) = row.across(begin.to_floats());
-        let (other_end, _) = row.across(end.to_floats());
-        let (near, far) = (one_end.min(other_end), one_end.max(other_end));
-        let (near, far) = (row.cell[1] + near, row.cell[1] + far);
-        let (along, across) = (low.shr(bits), near.shr(bits));
-        let outside = low.lt(none)
-            | track.end[0].lt(high)
-            | near.lt(none)
-            | !far.lt(track.end[1])
-            | track.last[0].lt(along)
-            | track.last[1].lt(across);
-        let inside = !outside & along.eq(high.shr(bits)) & across.eq(far.shr(bits));
-        self.inside[n] = (wanted & inside).bits();
+        let (begin, [[low, high], [near, far]]) = row.ends();
+        // The middle's tile. It has its neighbours' outermost texels, too.
+        let along = row.cell[0].shr(bits).min(track.last[0]);
+        let across = row.cell[1].shr(bits).min(track.last[1]);
+        let (corner_along, corner_across) = (along.shl(bits), across.shl(bits));
+        let ring = L::I::splat(TILE_RING as i32);
+        let most = L::I::splat((TILE_POSTS - TILE_RING - 1) as i32);
+        let first_along = (corner_along - ring).max(none);
+        let first_across = (corner_across - ring).max(none);
+        let last_along = (corner_along + most).min(track.end[0]);
+        let last_across = (corner_across + most).min(track.end[1]);
+        let outside = low.lt(first_along)
+            | last_along.lt(high)
+            | near.lt(first_across)
+            | !far.lt(last_across);
+        self.inside[n] = (wanted & !outside).bits();
         let tx = L::I::select(row.along_x, along, across);
         let ty = L::I::select(row.along_x, across, along);
         let number = ty.times(grid.last[0] + L::I::splat(1)) + tx;
         // From a texel of the middle's cell in the tile.
         let wide = L::I::splat(TILE_POSTS as i32);
-        let corner = (low - along.shl(bits)).times(wide) + track.copy;
+        let corner = (low - corner_along).times(wide) + track.copy;
         number.store(&mut self.number[at..]);
-        (corner + row.cell[1] - across.shl(bits)).store(&mut self.first[at..]);
+        (corner + row.cell[1] - corner_across).store(&mut self.first[at..]);
         row.side.store(&mut self.side[at..]);
         begin.to_floats().store(&mut self.begin[at..]);
         track.start.store(&mut self.start[at..]);
@@ -224,9 +225,9 @@ impl Rows {
             coverage: L::F::load(&sums.coverage[at..]),
             unsure: L::M::from_bits(sums.unsure[n]),
         };
-        self.inner::<L>(sheets, n, is_coarser, &mut sum, missing);
-        let mut rest = L::M::from_bits(self.wanted[n] & !self.inside[n]);
         let level = self.level::<L>(at, is_coarser);
+        let mut rest = L::M::from_bits(self.wanted[n] & !self.inside[n]);
+        rest = rest | self.inner::<L>(sheets, n, level, &mut sum, missing);
         while rest.any() {
             let known = first::<L>(level, rest);
             let here = rest & level.eq(L::I::splat(known));
@@ -243,27 +244,31 @@ impl Rows {
         sums.unsure[n] = sum.unsure.bits();
     }
 
-    /// Those rows that lie in one tile as a whole.
+    /// Those rows that one tile has as a whole. Returns those of them that go on beyond a
+    /// tile that is empty, and so does not have its neighbours' texels.
     #[inline(always)]
     fn inner<L: Lanes>(
         &self,
         sheets: &mut Sheets<PhotoTile>,
         n: usize,
-        is_coarser: bool,
+        level: L::I,
         sum: &mut Sum<L>,
         missing: &mut Wanted,
-    ) {
+    ) -> L::M {
         let at = n * L::N;
-        let wide = L::I::splat(TILE_POSTS as i32);
-        let (level, number) = (self.level::<L>(at, is_coarser), L::I::load(&self.number[at..]));
+        let (wide, number) = (L::I::splat(TILE_POSTS as i32), L::I::load(&self.number[at..]));
         let mut left = L::M::from_bits(self.inside[n]);
+        let mut beyond = L::M::none();
         while left.any() {
             let (known_level, known) = (first::<L>(level, left), first::<L>(number, left));
             let here = left & level.eq(L::I::splat(known_level)) & number.eq(L::I::splat(known));
             left = left & !here;
             let texels = match sheets.tile(known_level, known, missing) {
                 Soil::Tile(tile) => tile.texels(),
-                Soil::Empty => continue,
+                Soil::Empty => {
+                    beyond = beyond | (here & !self.row::<L>(n, level).is_in_its_tile());
+                    continue;
+                }
                 Soil::Absent => {
                     sum.unsure = sum.unsure | here;
                     continue;
@@ -287,6 +292,7 @@ impl Rows {
                 going = going & step.lt(stop);
             }
         }
+        beyond
     }
 
     #[inline(always)]
@@ -401,15 +407,14 @@ impl<L: Lanes> Track<L> {
         let along_x = row.along_x;
         let ring = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING) as i32);
         let turned = L::I::splat((TILE_RING * TILE_POSTS + TILE_RING + TURNED) as i32);
-        let reach = row.length * L::F::splat(0.5);
-        let middle = row.middle + L::F::splat(0.5);
         let ([x_end, y_end], [x_last, y_last]) = (grid.end, grid.last);
+        let [start, stop] = row.reach();
         Track {
             end: [L::I::select(along_x, x_end, y_end), L::I::select(along_x, y_end, x_end)],
             last: [L::I::select(along_x, x_last, y_last), L::I::select(along_x, y_last, x_last)],
             copy: L::I::select(along_x, turned, ring),
-            start: middle - reach,
-            stop: middle + reach,
+            start,
+            stop,
             scale: share.div(row.length),
         }
     }
@@ -470,6 +475,42 @@ fn outer<L: Lanes>(
 }
 
 impl<L: Lanes> Row<L> {
+    /// Where it begins and ends along itself; see [`Track`].
+    #[inline(always)]
+    fn reach(&self) -> [L::F; 2] {
+        let reach = self.length * L::F::splat(0.5);
+        let middle = self.middle + L::F::splat(0.5);
+        [middle - reach, middle + reach]
+    }
+
+    /// How far from the middle's its first texel is, and the first and last one along the
+    /// row and across, where there is one more that these are blended with.
+    #[inline(always)]
+    fn ends(&self) -> (L::I, [[L::I; 2]; 2]) {
+        let [start, stop] = self.reach();
+        let (begin, end) = (start.floor(), stop.floor());
+        let (one_end, _) = self.across(begin.to_floats());
+        let (other_end, _) = self.across(end.to_floats());
+        let [along, across] = self.cell;
+        let (near, far) = (one_end.min(other_end), one_end.max(other_end));
+        (begin, [[along + begin, along + end], [across + near, across + far]])
+    }
+
+    /// Whether it needs nothing of the tiles beside its middle's.
+    #[inline(always)]
+    fn is_in_its_tile(&self) -> L::M {
+        let (_, ends) = self.ends();
+        let bits = L::I::splat(TILE_BITS);
+        let mut inside = !L::M::none();
+        for axis in 0..2 {
+            let tile = self.cell[axis].shr(bits);
+            for n in 0..2 {
+                inside = inside & ends[axis][n].shr(bits).eq(tile);
+            }
+        }
+        inside
+    }
+
     /// How far across a row is beside a texel along it, from the middle's: the texel, and
     /// the way from there to the next.
     #[inline(always)]

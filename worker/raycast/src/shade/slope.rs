@@ -6,7 +6,7 @@
 //!
 //! Step by step for some places at once, as in `photo`.
 
-use super::batch::{AT_ONCE, VECTORS};
+use super::batch::{Each, VECTORS};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
 use crate::field::Wanted;
@@ -23,23 +23,23 @@ const ROUNDING_POSTS: f32 = 0.01;
 pub(crate) struct Cells {
     /// The places that the layer shows.
     pub lanes: [u32; VECTORS],
-    cell: [[i32; AT_ONCE]; 2],
-    part: [[f32; AT_ONCE]; 2],
+    cell: [Each<i32>; 2],
+    part: [Each<f32>; 2],
     /// The finer level, and the share of the coarser one.
-    level: [i32; AT_ONCE],
-    coarser: [f32; AT_ONCE],
+    level: Each<i32>,
+    coarser: Each<f32>,
     /// The places whose cells are to be read.
     wanted: [u32; VECTORS],
     /// Of a cell in its level: the tile, the post in it before the cell's own along both
     /// axes, and the place in the cell.
-    number: [i32; AT_ONCE],
-    post: [i32; AT_ONCE],
-    place: [[f32; AT_ONCE]; 2],
+    number: Each<i32>,
+    post: Each<i32>,
+    place: [Each<f32>; 2],
 }
 
 impl Cells {
     pub(crate) fn new() -> Self {
-        let (none, zero) = ([0.0; AT_ONCE], [0; AT_ONCE]);
+        let (none, zero) = (Each::new(0.0), Each::new(0));
         Cells {
             lanes: [0; VECTORS],
             cell: [zero; 2],
@@ -147,7 +147,7 @@ impl Cells {
         sheets: &mut Sheets<HeightTile>,
         n: usize,
         is_coarser: bool,
-        slopes: &mut [[f32; AT_ONCE]; 2],
+        slopes: &mut [Each<f32>; 2],
         unsure: &mut u32,
         missing: &mut Wanted,
     ) {
