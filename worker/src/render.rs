@@ -27,11 +27,14 @@ use terrafarm_raycast::{
 use terrafarm_terrain::layout::{StoreIndex, TileKey};
 use terrafarm_terrain::resident::Resident;
 
-/// Side of a piece, pixels: some milliseconds of one core, and dozens of pieces even in a
-/// small frame. Views of the demo's flight by `auto`, 1920 x 1080, nanoseconds a pixel for
-/// sides of 32, 64, 128 and 256: finding depths 34, 23, 19, 18, all 51, 39, 34, 34 (example
-/// `frame` of the ray caster).
+/// Side of a piece, pixels: dozens of pieces even in a small frame. Views of the demo's flight
+/// by `auto`, 1920 x 1080, nanoseconds a pixel for sides of 32, 64, 128 and 256: finding depths
+/// 33, 16, 13, 11.5, all 46, 29, 25, 23.5 (example `frame` of the ray caster).
 const PIECE_PX: u32 = 128;
+/// Side of a piece where each thread gets at least [`LARGE_PIECES`] of them, or one thread all.
+const LARGE_PIECE_PX: u32 = 256;
+/// So many that threads that wait for the last one cost less than the larger pieces save.
+const LARGE_PIECES: u64 = 16;
 
 /// How rays are cast. There is one way, [`RayCaster`]; tests put others in its place.
 pub trait Caster: Send + Sync + 'static {
@@ -246,7 +249,8 @@ impl<C: Caster> Job<C> {
         check: Check,
         stop: Arc<AtomicBool>,
     ) -> Self {
-        let pieces = tiles(region.width, region.height, PIECE_PX).into_iter().map(|piece| {
+        let side = piece_px(region, rayon::current_num_threads() as u64);
+        let pieces = tiles(region.width, region.height, side).into_iter().map(|piece| {
             let region = Region { x: region.x + piece.x, y: region.y + piece.y, ..piece };
             Piece {
                 region,
@@ -379,6 +383,13 @@ impl<C: Caster> Job<C> {
         let errors = (self.check.share != Share::NONE).then_some(errors);
         Ok(Picture { pixels: picture.into_pixels(), stats, coarser, errors, spent, coreless })
     }
+}
+
+/// The side of the pieces of a region that so many threads render.
+fn piece_px(region: Region, threads: u64) -> u32 {
+    let pixels = u64::from(region.width) * u64::from(region.height);
+    let large = pixels / u64::from(LARGE_PIECE_PX).pow(2);
+    if threads == 1 || large >= LARGE_PIECES * threads { LARGE_PIECE_PX } else { PIECE_PX }
 }
 
 /// Has the threads of the pool that it is called on take items until there are none, never

@@ -16,13 +16,15 @@
 //! A sample of the hits is compared with the `reference` method first: nothing wrong is
 //! timed.
 
+#[path = "time/best.rs"]
+mod best;
 #[allow(dead_code)]
 #[path = "../src/tests_support.rs"]
 mod tests_support;
 
+use best::best;
 use glam::DVec3;
 use std::path::Path;
-use std::time::Instant;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
@@ -86,25 +88,6 @@ fn main() {
             println!("{name:6} cold: {asked} tiles asked for in {rounds} rounds");
         }
     }
-}
-
-/// The shortest time of a call, seconds, and what it returned last.
-fn best<T>(runs: usize, mut call: impl FnMut() -> T) -> (f64, T) {
-    let mut time = f64::INFINITY;
-    let mut result = None;
-    for _ in 0..runs.max(1) {
-        let (start, start_cpu) = (Instant::now(), cpu_s());
-        result = Some(call());
-        let taken = cpu_s().zip(start_cpu).map(|(end, start)| end - start);
-        time = time.min(taken.unwrap_or(start.elapsed().as_secs_f64()));
-    }
-    (time, result.expect("it was called at least once"))
-}
-
-/// Time that this thread has had on a core, seconds, where the system tells (Linux).
-fn cpu_s() -> Option<f64> {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    Some(text.split(' ').next()?.parse::<f64>().ok()? * 1e-9)
 }
 
 fn noise_land() -> Resident {

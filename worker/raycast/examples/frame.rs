@@ -10,13 +10,15 @@
 //! of RUNS (9) runs: finding depths alone, shading alone, the whole frame, and if asked for depths and
 //! the whole in pieces of several sides. At the end a hash of the bytes.
 
+#[path = "time/best.rs"]
+mod best;
 #[allow(dead_code)]
 #[path = "../src/tests_support.rs"]
 mod tests_support;
 
+use best::best;
 use glam::DVec3;
 use std::path::Path;
-use std::time::Instant;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Region;
@@ -48,13 +50,13 @@ fn main() {
     for pose in POSES {
         let view = view(pose);
         let (trace, found) =
-            best(runs, || depths(&resident, &pyramid, &view, frame).expect("the store fits"));
+            timed(runs, || depths(&resident, &pyramid, &view, frame).expect("the store fits"));
         let distances = distances(&view, &found.inverse_depth);
         let mut pixels = vec![0; distances.len() * 3];
         let (shading, _) =
-            best(runs, || shade(&resident, &pyramid, &view, frame, &distances, &mut pixels));
+            timed(runs, || shade(&resident, &pyramid, &view, frame, &distances, &mut pixels));
         let (whole, rendered) =
-            best(runs, || render(&resident, &pyramid, &view, frame).expect("the store fits"));
+            timed(runs, || render(&resident, &pyramid, &view, frame).expect("the store fits"));
         assert!(rendered.missing.is_empty());
         let sky = distances.iter().filter(|s| s.is_infinite()).count();
         print!(
@@ -74,12 +76,12 @@ fn main() {
                     height: (height as u32).min(SIZE.1 - y),
                 })
                 .collect();
-            let (trace, _) = best(runs, || {
+            let (trace, _) = timed(runs, || {
                 for &region in &regions {
                     depths(&resident, &pyramid, &view, region).expect("the store fits");
                 }
             });
-            let (time, _) = best(runs, || {
+            let (time, _) = timed(runs, || {
                 for &region in &regions {
                     render(&resident, &pyramid, &view, region).expect("the store fits");
                 }
@@ -97,24 +99,10 @@ fn digest(bytes: &[u8]) -> u64 {
     })
 }
 
-/// The shortest time of a call, nanoseconds a pixel of the frame, and what it returned last.
-fn best<T>(runs: usize, mut call: impl FnMut() -> T) -> (f64, T) {
-    let mut time = f64::INFINITY;
-    let mut result = None;
-    for _ in 0..runs.max(1) {
-        let (start, start_cpu) = (Instant::now(), cpu_s());
-        result = Some(call());
-        let taken = cpu_s().zip(start_cpu).map(|(end, start)| end - start);
-        time = time.min(taken.unwrap_or(start.elapsed().as_secs_f64()));
-    }
-    let pixels = f64::from(SIZE.0) * f64::from(SIZE.1);
-    (time * 1e9 / pixels, result.expect("it was called at least once"))
-}
-
-/// Time that this thread has had on a core, seconds, where the system tells (Linux).
-fn cpu_s() -> Option<f64> {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    Some(text.split(' ').next()?.parse::<f64>().ok()? * 1e-9)
+/// As [`best`], in nanoseconds a pixel of the frame.
+fn timed<T>(runs: usize, call: impl FnMut() -> T) -> (f64, T) {
+    let (time_s, result) = best(runs, call);
+    (time_s * 1e9 / (f64::from(SIZE.0) * f64::from(SIZE.1)), result)
 }
 
 fn loaded(path: &Path) -> Resident {
