@@ -26,9 +26,9 @@ use crate::lod::{Alone, cast_pixels};
 use crate::relief::Relief;
 use crate::seen::Seen;
 use crate::walk::{Fineness, Lines, Rows, Walk};
-use doubts::{Doubts, SKY};
+use doubts::{Doubts, GUESSES, SKY};
 use glam::DVec2;
-use net::{BENT, BROKEN, Bends, Net, OPEN};
+use net::{BEHIND, BENT, BROKEN, Bends, Net, OPEN};
 pub(crate) use net::{TOLD, WHOLE};
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
@@ -81,7 +81,8 @@ impl Kernel for Columns<'_, '_> {
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
         let mut seen = Seen::new(self.region);
-        let (mut net, mut doubts, mut alone) = (Net::new(), Doubts::new(), Vec::new());
+        let (mut net, mut alone) = (Net::new(), Vec::new());
+        let (mut doubts, mut rest) = (Doubts::default(), Doubts::default());
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
         for by_rows in [true, false] {
@@ -99,7 +100,8 @@ impl Kernel for Columns<'_, '_> {
                             let rows = (row, span.pixels.clone());
                             self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut doubts);
                         }
-                        self.decide::<L>(&mut doubts, &mut seen.inverse_depth, &mut alone);
+                        let depths = &mut seen.inverse_depth;
+                        self.decide::<L>([&mut doubts, &mut rest], depths, &mut alone);
                     }
                 }
             }
@@ -291,6 +293,7 @@ impl Columns<'_, '_> {
         let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
         let [answers, states, tips] = net.row(fan.ray(row));
         let numbers = L::F::load(&NUMBERS);
+        let first_line = L::I::splat(net.first_line);
         let sparse = scale < DENSEST;
         let region = self.region;
         let mut places = [0; MOST];
@@ -300,7 +303,7 @@ impl Columns<'_, '_> {
             let line = start + minor * L::F::splat(scale as f32);
             let left = line.floor();
             let share = line - left.to_floats();
-            let left = left - L::I::splat(net.first_line);
+            let left = left - first_line;
             let (a, b, state) = if sparse {
                 left.store(&mut places);
                 let base = places[0].max(0) as usize;
@@ -315,8 +318,8 @@ impl Columns<'_, '_> {
             let open = L::F::splat(OPEN).eq(state);
             let answer = L::F::select(open, L::F::splat(f32::NAN), a + (b - a) * share);
             let count = L::N.min((pixels.end - pixel) as usize);
-            let doubtful = L::F::splat(BENT).le(state) & !open;
-            let doubtful = doubtful.bits() & (u32::MAX >> (32 - count));
+            let within = L::M::from_bits(u32::MAX >> (32 - count));
+            let doubtful = L::F::splat(BENT).le(state) & !open & within;
             if frame.by_rows {
                 let at = (row - region.y) as usize * region.width as usize;
                 let at = at + (pixel - region.x) as usize;
@@ -335,49 +338,43 @@ impl Columns<'_, '_> {
                     pixels[column] = answer;
                 }
             }
-            if doubtful != 0 {
-                let (mut firsts, mut seconds) = ([0.0; MOST], [0.0; MOST]);
-                a.store(&mut firsts);
-                b.store(&mut seconds);
-                let (mut between, mut kinds) = ([0.0; MOST], [0.0; MOST]);
-                answer.store(&mut between);
-                state.store(&mut kinds);
-                left.store(&mut places);
-                let mut bits = doubtful;
-                while bits != 0 {
-                    let lane = bits.trailing_zeros() as usize % MOST;
-                    bits &= bits - 1;
-                    let minor = pixel + lane as u32;
-                    let place = if frame.by_rows { [minor, row] } else { [row, minor] };
-                    let around = [firsts[lane], seconds[lane]];
-                    let guesses = match kinds[lane] {
-                        BENT => [between[lane], 0.0, 0.0],
-                        BROKEN => broken(around, None),
-                        _ => {
-                            let tips = &tips[places[lane] as usize..];
-                            let tip = tips[0].max(tips[1]);
-                            let same = net::same(around);
-                            let other = if between[lane] > 0.0 { between[lane] } else { SKY };
-                            if same { [tip, other, 0.0] } else { broken(around, Some(tip)) }
-                        }
-                    };
-                    doubts.push(place, guesses);
+            if doubtful.any() {
+                let mut guesses = [answer, L::F::splat(0.0), L::F::splat(0.0)];
+                if (doubtful & L::F::splat(BROKEN).le(state)).any() {
+                    let (tip, beside) = gathered::<L>(tips, left);
+                    guesses = torn::<L>([a, b], answer, tip.max(beside), state);
                 }
+                let (minor, major) = (minor.truncate(), L::I::splat(row as i32));
+                let place = if frame.by_rows { [minor, major] } else { [major, minor] };
+                doubts.push::<L>(place, guesses, doubtful);
             }
         }
     }
 }
 
-/// Where a pixel may see ground between two rays that see different ground, or on a closer
-/// one that ends a little lower.
-fn broken([a, b]: [f32; 2], tip: Option<f32>) -> [f32; 3] {
-    let whole = |answer: f32| answer.to_bits() as i32 & WHOLE != 0;
+/// Where pixels may see ground, in the order in which it is to be tried, by the state between
+/// their rays `a` and `b`. Where these see different ground, it is on either of the two;
+/// where closer ground ends a little lower, it may be on that.
+#[inline(always)]
+fn torn<L: Lanes>([a, b]: [L::F; 2], between: L::F, tip: L::F, state: L::F) -> [L::F; GUESSES] {
+    let zero = L::F::splat(0.0);
+    let (low, high) = (a.min(b), a.max(b));
     // Behind voids there may be any ground, not just one of the two.
-    let far = if whole(a) && whole(b) { a.min(b) } else { 0.0 };
-    match tip {
-        Some(tip) => [tip, a.max(b), far],
-        None => [a.max(b), far, 0.0],
-    }
+    let whole = L::I::splat(WHOLE);
+    let whole = (a.to_bits() & b.to_bits() & whole).eq(whole);
+    let far = L::F::select(whole, low, zero);
+    let or_sky = L::F::select(zero.lt(between), between, L::F::splat(SKY));
+    let same = net::same::<L>(a, b);
+    let (bent, behind) = (state.eq(L::F::splat(BENT)), state.eq(L::F::splat(BEHIND)));
+    let third = L::F::select(behind & !same, far, zero);
+    let second = L::F::select(same, or_sky, high);
+    let second = L::F::select(behind, second, far);
+    let first = L::F::select(behind, tip, high);
+    [
+        L::F::select(bent, between, first),
+        L::F::select(bent, zero, second),
+        L::F::select(bent, zero, third),
+    ]
 }
 
 /// The numbers of the lanes.

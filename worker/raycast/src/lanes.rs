@@ -71,6 +71,9 @@ pub(crate) trait Floats:
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
+    /// The lanes in `mask`, in their order, into the first places of a slice. What is behind
+    /// them in its first N places may change; panics if there are fewer.
+    fn pack(self, values: &mut [f32], mask: Self::M);
 }
 
 /// One f64 a lane.
@@ -119,6 +122,8 @@ pub(crate) trait Ints:
     fn splat(value: i32) -> Self;
     fn load(values: &[i32]) -> Self;
     fn store(self, values: &mut [i32]);
+    /// As [`Floats::pack`].
+    fn pack(self, values: &mut [i32], mask: Self::M);
     /// The three low bytes of each lane, one lane's behind the other's, into the first 3 N
     /// places of a slice; panics if there are fewer.
     fn store_threes(self, bytes: &mut [u8]);
@@ -317,6 +322,34 @@ pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    struct Packs;
+
+    impl Kernel for Packs {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Lanes>(self) {
+            let numbers: [i32; MOST] = std::array::from_fn(|n| n as i32 - 3);
+            let lanes = L::I::load(&numbers);
+            for bits in 0..1u32 << L::N {
+                let wanted: Vec<i32> =
+                    (0..L::N).filter(|n| bits >> n & 1 == 1).map(|n| numbers[n]).collect();
+                let (mut ints, mut floats) = ([0; MOST], [0.0; MOST]);
+                lanes.pack(&mut ints, L::M::from_bits(bits));
+                lanes.to_floats().pack(&mut floats, L::M::from_bits(bits));
+                assert_eq!(ints[..wanted.len()], wanted);
+                assert_eq!(floats.map(|float| float as i32)[..wanted.len()], wanted);
+            }
+        }
+    }
+
+    #[test]
+    fn packed_lanes_are_those_of_the_mask_in_their_order() {
+        for width in Width::available() {
+            run(Packs, width);
+        }
+    }
 
     #[test]
     fn a_limit_of_the_width_holds_on_its_thread_until_its_end() {

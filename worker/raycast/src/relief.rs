@@ -100,6 +100,23 @@ pub(crate) enum Soil<'a> {
     Absent,
 }
 
+/// The surface under N places, which is bilinear within a cell.
+pub(crate) struct Surface<L: Lanes> {
+    /// Whether there is any, and whether that is unknown for lack of a tile.
+    pub solid: L::M,
+    pub absent: L::M,
+    /// Height over the camera, metres.
+    pub height: L::F,
+    /// Slopes along x and y.
+    pub slopes: [L::F; 2],
+    /// Where in its cell a place is along x and y, from 0 to 1 ...
+    pub part: [L::F; 2],
+    /// ... and by how much that grows, per metre.
+    pub pace: [L::F; 2],
+    /// How much more the cell rises along one side than along the other, metres.
+    pub twist: L::F,
+}
+
 impl<'a> Relief<'a> {
     /// The store must have one height layer, with at least one cell.
     pub(crate) fn new(field: Field<'a>, view: &View, tolerance_px: f64, lack: Lack) -> Self {
@@ -142,15 +159,9 @@ impl<'a> Relief<'a> {
         group[place].get_or_init(|| self.meet(number))
     }
 
-    /// The surface under places on the map, metres from the camera: whether there is any,
-    /// whether that is unknown for lack of a tile, its height over the camera, and its slopes
-    /// along x and y.
+    /// The surface under places on the map, metres from the camera.
     #[inline(always)]
-    pub(crate) fn surface<L: Lanes>(
-        &self,
-        place: [L::F; 2],
-        lanes: L::M,
-    ) -> (L::M, L::M, L::F, [L::F; 2]) {
+    pub(crate) fn surface<L: Lanes>(&self, place: [L::F; 2], lanes: L::M) -> Surface<L> {
         let zero = L::F::splat(0.0);
         let scale = [0, 1].map(|axis| (1.0 / self.spacing[axis]) as f32);
         let x = L::F::splat(self.eye_place[0]) + place[0] * L::F::splat(scale[0]);
@@ -164,8 +175,15 @@ impl<'a> Relief<'a> {
             & cell_y.lt(L::I::splat(self.cells[1]));
         let bits = L::I::splat(MAXIMA_LEVELS as i32);
         let plots = cell_y.shr(bits).times(L::I::splat(self.plots[0])) + cell_x.shr(bits);
-        let (mut solid, mut absent) = (L::M::none(), L::M::none());
-        let (mut height, mut slopes) = (zero, [zero; 2]);
+        let mut found = Surface {
+            solid: L::M::none(),
+            absent: L::M::none(),
+            height: zero,
+            slopes: [zero; 2],
+            part: [zero; 2],
+            pace: [zero; 2],
+            twist: zero,
+        };
         let mut left = lanes & inside;
         let mut numbers = [0; MOST];
         plots.store(&mut numbers);
@@ -178,28 +196,34 @@ impl<'a> Relief<'a> {
                 Soil::Loaded(loaded) => loaded,
                 Soil::Void => continue,
                 Soil::Absent => {
-                    absent = absent | here;
+                    found.absent = found.absent | here;
                     continue;
                 }
             };
             let base = L::I::splat(plot.level as i32);
-            let shrink = L::F::splat(1.0 / (1u32 << plot.level) as f32);
+            let shrink = 1.0 / (1u32 << plot.level) as f32;
             let (i, j) = (cell_x.shr(base), cell_y.shr(base));
             let corner_x = (i.shl(base) - L::I::splat(self.eye_cell[0])).to_floats();
             let corner_y = (j.shl(base) - L::I::splat(self.eye_cell[1])).to_floats();
-            let (u, v) = ((x - corner_x) * shrink, (y - corner_y) * shrink);
+            let side = L::F::splat(shrink);
+            let part = [(x - corner_x) * side, (y - corner_y) * side];
             let (there, [sw, se, nw, ne]) = loaded.posts().corners::<L>(self.eye_z, [i, j], here);
             let (south, north) = (se - sw, ne - nw);
-            let (low, high) = (sw + south * u, nw + north * u);
-            let found = low + (high - low) * v;
-            let slope_x = (south + (north - south) * v) * (shrink * L::F::splat(scale[0]));
-            let slope_y = (high - low) * (shrink * L::F::splat(scale[1]));
-            height = L::F::select(here, found, height);
-            slopes[0] = L::F::select(here, slope_x, slopes[0]);
-            slopes[1] = L::F::select(here, slope_y, slopes[1]);
-            solid = solid | (here & there);
+            let (low, high) = (sw + south * part[0], nw + north * part[0]);
+            let pace = [L::F::splat(shrink * scale[0]), L::F::splat(shrink * scale[1])];
+            let twist = north - south;
+            let height = low + (high - low) * part[1];
+            found.height = L::F::select(here, height, found.height);
+            found.twist = L::F::select(here, twist, found.twist);
+            let slopes = [(south + twist * part[1]) * pace[0], (high - low) * pace[1]];
+            for axis in 0..2 {
+                found.slopes[axis] = L::F::select(here, slopes[axis], found.slopes[axis]);
+                found.part[axis] = L::F::select(here, part[axis], found.part[axis]);
+                found.pace[axis] = L::F::select(here, pace[axis], found.pace[axis]);
+            }
+            found.solid = found.solid | (here & there);
         }
-        (solid, absent, height, slopes)
+        found
     }
 
     /// Tiles that were needed but not loaded, sorted, each once.

@@ -25,11 +25,14 @@ pub(crate) const TOLD: i32 = 1;
 /// How many times more answers must bend than straight lines may, for two rays to see
 /// different ground.
 const TORN: f32 = 8.0;
+/// How many times more answers may bend at one of two rays, if they hardly bend at the
+/// other, than at both.
+const MOST_BENT: f32 = 4.0;
 /// How many times larger the change from row to row must be than that before it, for closer
 /// ground to end there.
 const ENDS: f32 = 2.0;
 
-/// How much answers may bend, for pixels between to lie on straight lines.
+/// How much answers may bend at both of two rays, for pixels between to lie on straight lines.
 #[derive(Clone, Copy)]
 pub(super) struct Bends {
     /// As a share of what they change by from row to row, where that is a measure of what
@@ -96,10 +99,12 @@ impl Net {
     /// next row, or with `rising` in the one before; `reach` rows lower are looked at for
     /// ground that may come up between rays.
     ///
-    /// Between two rays the ground is a line as far as it does not bend: what the answers
-    /// bend by at both rays bounds what it is off by if it bends in one place, and is
-    /// eight times that if it bends evenly. It counts in pixels, by the change of the
-    /// answers from row to row, or by what they are.
+    /// Between two rays the ground is a line as far as it does not bend. Where it bends by
+    /// s in one place, t of the way from ray to ray, the answers bend by (1 - t) s at the one
+    /// and by t s at the other, and the line is off by at most t (1 - t) s: their product over
+    /// their sum. Where it bends evenly, or in more places to the same side, it is off by
+    /// less. It counts in pixels, by the change of the answers from row to row, or by what
+    /// they are. Bends to both sides can hide each other at a ray, hence [`MOST_BENT`].
     #[inline(always)]
     pub fn compare<L: Lanes>(&mut self, allowed: Bends, rising: bool, reach: usize) {
         let Net { answers, states, bends, ends, tips, peaked, width, .. } = self;
@@ -171,7 +176,7 @@ impl Net {
                 let (here, before, after) = (row + column, before + column, after + column);
                 let (a, b) = (load(here), load(here + 1));
                 let (low, high) = (a.min(b), a.max(b));
-                let same = (high * neighbours).le(low);
+                let same = same::<L>(a, b);
                 let (bend_a, bend_b) = (L::F::load(&bends[here..]), L::F::load(&bends[here + 1..]));
                 let bend = bend_a.max(bend_b);
                 let around = (load(before) + load(before + 1)) + (load(after) + load(after + 1));
@@ -181,7 +186,9 @@ impl Net {
                 let even = (change * of_change).max(low * of_depth);
                 let told = (a.to_bits() & b.to_bits() & told).eq(told);
                 let same = same & bend.le(even * L::F::splat(TORN)) | high.eq(zero);
-                let even = (told & bend.le(even)) | high.eq(zero);
+                let off = (bend_a * bend_b).le(even * L::F::splat(0.5) * (bend_a + bend_b));
+                let straight = off & bend.le(even * L::F::splat(MOST_BENT));
+                let even = (told & straight) | high.eq(zero);
                 let tip = L::F::load(&tips[here..]).max(L::F::load(&tips[here + 1..]));
                 let state = L::F::select(even, flat, uneven);
                 let state = L::F::select(same, state, broken);
@@ -194,8 +201,9 @@ impl Net {
 }
 
 /// Whether two answers are of the same ground.
-pub(super) fn same([a, b]: [f32; 2]) -> bool {
-    a.max(b) * (1.0 - NEIGHBOURS) <= a.min(b)
+#[inline(always)]
+pub(super) fn same<L: Lanes>(a: L::F, b: L::F) -> L::M {
+    (a.max(b) * L::F::splat(1.0 - NEIGHBOURS)).le(a.min(b))
 }
 
 /// The row that is so many rows lower, if there is one.

@@ -88,6 +88,17 @@ macro_rules! binary {
     };
 }
 
+/// The numbers of the lanes in a mask, in their order, and then any.
+#[inline(always)]
+fn packed(mask: M) -> __m256i {
+    // SAFETY: see the page of this module.
+    unsafe {
+        let bytes = _pdep_u64(u64::from(mask.bits()), 0x0101_0101_0101_0101) * 0xFF;
+        let numbers = _pext_u64(0x0706_0504_0302_0100, bytes);
+        _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(numbers as i64))
+    }
+}
+
 impl Floats for F {
     type I = I;
     type M = M;
@@ -175,6 +186,11 @@ impl Floats for F {
             bits &= bits - 1;
         }
     }
+    #[inline(always)]
+    fn pack(self, values: &mut [f32], mask: M) {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm256_permutevar8x32_ps(self.0, packed(mask))).store(values) }
+    }
 }
 
 impl Ints for I {
@@ -194,6 +210,11 @@ impl Ints for I {
     fn store(self, values: &mut [i32]) {
         // SAFETY: see the page of this module.
         unsafe { _mm256_storeu_si256(values[..8].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn pack(self, values: &mut [i32], mask: M) {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm256_permutevar8x32_epi32(self.0, packed(mask))).store(values) }
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {

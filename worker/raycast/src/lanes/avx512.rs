@@ -181,6 +181,11 @@ impl Floats for F {
             _mm512_mask_i32scatter_ps::<4>(table.as_mut_ptr().cast(), mask.0, at, self.0);
         }
     }
+    #[inline(always)]
+    fn pack(self, values: &mut [f32], mask: M) {
+        // SAFETY: see the page of this module.
+        unsafe { F(_mm512_maskz_compress_ps(mask.0, self.0)).store(values) }
+    }
 }
 
 impl Ints for I {
@@ -200,6 +205,11 @@ impl Ints for I {
     fn store(self, values: &mut [i32]) {
         // SAFETY: see the page of this module.
         unsafe { _mm512_storeu_si512(values[..16].as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn pack(self, values: &mut [i32], mask: M) {
+        // SAFETY: see the page of this module.
+        unsafe { I(_mm512_maskz_compress_epi32(mask.0, self.0)).store(values) }
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {

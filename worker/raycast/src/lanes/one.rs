@@ -145,6 +145,12 @@ impl Floats for F {
             table[(at.0 as u32 as usize).min(last)] = self.0;
         }
     }
+    #[inline(always)]
+    fn pack(self, values: &mut [f32], mask: M) {
+        if mask.0 {
+            values[0] = self.0;
+        }
+    }
 }
 
 impl Ints for I {
@@ -161,6 +167,12 @@ impl Ints for I {
     #[inline(always)]
     fn store(self, values: &mut [i32]) {
         values[0] = self.0;
+    }
+    #[inline(always)]
+    fn pack(self, values: &mut [i32], mask: M) {
+        if mask.0 {
+            values[0] = self.0;
+        }
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {
