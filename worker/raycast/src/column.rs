@@ -101,7 +101,7 @@ impl Kernel for Columns<'_, '_> {
                             self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut doubts);
                         }
                         let depths = &mut seen.inverse_depth;
-                        self.decide::<L>([&mut doubts, &mut rest], depths, &mut alone);
+                        self.decide::<L>(&mut doubts, &mut rest, depths, &mut alone);
                     }
                 }
             }

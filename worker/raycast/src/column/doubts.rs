@@ -7,7 +7,7 @@ use crate::lod::Alone;
 use crate::walk::Slopes;
 
 /// How often a pixel is compared with the surface at most ...
-const CORRECTIONS: usize = 4;
+const CORRECTIONS: i32 = 4;
 /// ... and by what share of its depth it may be moved each time.
 const FARTHEST: f32 = 0.05;
 /// How much closer than the nearest ground seen around a pixel its own ray begins to look:
@@ -27,6 +27,8 @@ pub(super) struct Doubts {
     /// One over the depths at which they may be, in the order in which they are tried; 0
     /// for none, [`SKY`] if it is the sky then.
     guesses: [Vec<f32>; GUESSES],
+    /// How often the first guess was moved.
+    tries: Vec<i32>,
 }
 
 /// Guesses of a pixel at most.
@@ -45,38 +47,34 @@ struct Step<L: Lanes> {
     answer: L::F,
 }
 
-/// N pixels: their rays, for one along the axis of the camera.
-struct Sights<L: Lanes> {
-    ray: [L::F; 3],
-    /// The square of the ray's length along the map.
-    across: L::F,
-    /// The square of what the tolerance allows at a depth of 1.
-    allowed: L::F,
+/// N of the pixels.
+struct Pixels<L: Lanes> {
+    place: [L::I; 2],
+    nearest: L::F,
+    guesses: [L::F; GUESSES],
+    tries: L::I,
 }
 
 impl Doubts {
     /// Adds pixels whose first guess is the closest one.
     #[inline(always)]
     pub fn push<L: Lanes>(&mut self, place: [L::I; 2], guesses: [L::F; GUESSES], lanes: L::M) {
-        self.add::<L>(place, guesses[0], guesses, lanes);
+        let (nearest, tries) = (guesses[0], L::I::splat(0));
+        self.add::<L>(&Pixels { place, nearest, guesses, tries }, lanes);
     }
 
     #[inline(always)]
-    fn add<L: Lanes>(
-        &mut self,
-        [x, y]: [L::I; 2],
-        nearest: L::F,
-        guesses: [L::F; GUESSES],
-        lanes: L::M,
-    ) {
+    fn add<L: Lanes>(&mut self, pixels: &Pixels<L>, lanes: L::M) {
         let at = self.count;
         self.reserve(at + MOST);
+        let [x, y] = pixels.place;
         x.pack(&mut self.x[at..], lanes);
         y.pack(&mut self.y[at..], lanes);
-        nearest.pack(&mut self.nearest[at..], lanes);
+        pixels.nearest.pack(&mut self.nearest[at..], lanes);
         for n in 0..GUESSES {
-            guesses[n].pack(&mut self.guesses[n][at..], lanes);
+            pixels.guesses[n].pack(&mut self.guesses[n][at..], lanes);
         }
+        pixels.tries.pack(&mut self.tries[at..], lanes);
         self.count = at + lanes.count() as usize;
     }
 
@@ -94,6 +92,7 @@ impl Doubts {
         let length = (2 * length).next_multiple_of(MOST);
         self.x.resize(length, 0);
         self.y.resize(length, 0);
+        self.tries.resize(length, 0);
         for list in self.guesses.iter_mut().chain([&mut self.nearest]) {
             list.resize(length, 0.0);
         }
@@ -112,73 +111,56 @@ impl Doubts {
 }
 
 impl Columns<'_, '_> {
-    /// Puts pixels where their rays meet the surface, and clears the lists. Those that are
+    /// Puts pixels where their rays meet the surface, and clears the list. Those that are
     /// not found are added to `alone`.
     ///
-    /// Most are found where they are looked for first. The others are put into `rest`, so
-    /// that no lane waits for another.
+    /// One step is done for all pixels before the next is for those that need it, so that no
+    /// lane waits for another; `rest` is room for these.
     #[inline(always)]
     pub(super) fn decide<L: Lanes>(
         &self,
-        [doubts, rest]: [&mut Doubts; 2],
+        doubts: &mut Doubts,
+        rest: &mut Doubts,
         inverse_depth: &mut [f32],
         alone: &mut Vec<Alone>,
     ) {
         let frame = Frame::new(self.camera, true);
-        let zero = L::F::splat(0.0);
-        doubts.reserve(doubts.count + MOST);
-        for at in (0..doubts.count).step_by(L::N) {
-            let (place, lanes) = (doubts.place::<L>(at), doubts.lanes::<L>(at));
-            let [first, second, third] = &doubts.guesses;
-            let guess = L::F::load(&first[at..]);
-            let sights = self.sights::<L>(&frame, place);
-            let step = self.step::<L>(&sights, guess, lanes & zero.lt(guess));
-            step.answer.scatter(inverse_depth, self.places::<L>(place), step.sure);
-            let left = lanes & !step.sure;
-            if left.any() {
+        let (zero, none) = (L::F::splat(0.0), L::I::splat(0));
+        while doubts.count > 0 {
+            doubts.reserve(doubts.count + MOST);
+            for at in (0..doubts.count).step_by(L::N) {
+                let (place, lanes) = (doubts.place::<L>(at), doubts.lanes::<L>(at));
+                let guess = L::F::load(&doubts.guesses[0][at..]);
+                let step = self.step::<L>(&frame, place, guess, lanes & zero.lt(guess));
+                let places = self.places::<L>(place);
+                step.answer.scatter(inverse_depth, places, step.sure);
+                let left = lanes & !step.sure;
+                if !left.any() {
+                    continue;
+                }
+                let tries = L::I::load(&doubts.tries[at..]) + L::I::splat(1);
+                let open = step.open & tries.lt(L::I::splat(CORRECTIONS));
+                let second = L::F::load(&doubts.guesses[1][at..]);
+                let third = L::F::load(&doubts.guesses[2][at..]);
                 let guesses = [
-                    L::F::select(step.open, step.answer, zero),
-                    L::F::select(step.unknown, zero, L::F::load(&second[at..])),
-                    L::F::select(step.unknown, zero, L::F::load(&third[at..])),
+                    L::F::select(open, step.answer, second),
+                    L::F::select(open, second, third),
+                    L::F::select(open, third, zero),
                 ];
-                rest.add::<L>(place, guess, guesses, left);
-            }
-        }
-        doubts.count = 0;
-        rest.reserve(rest.count + MOST);
-        for at in (0..rest.count).step_by(L::N) {
-            let (place, lanes) = (rest.place::<L>(at), rest.lanes::<L>(at));
-            let sights = self.sights::<L>(&frame, place);
-            let (mut answer, mut sure, mut open) = (zero, L::M::none(), lanes);
-            for guesses in &rest.guesses {
-                let guess = L::F::load(&guesses[at..]);
-                let next = open & zero.lt(guess);
-                if next.any() {
-                    let (found, settled, unknown) = self.settle::<L>(&sights, guess, next);
-                    answer = L::F::select(settled, found, answer);
-                    sure = sure | settled;
-                    open = open & !settled & !unknown;
-                }
-                // The answer then is 0.
-                sure = sure | (open & guess.eq(L::F::splat(SKY)));
-                open = open & !sure;
-            }
-            let places = self.places::<L>(place);
-            answer.scatter(inverse_depth, places, lanes);
-            let mut lost = (lanes & !sure).bits();
-            if lost != 0 {
-                let mut numbers = [0; MOST];
-                places.store(&mut numbers);
-                while lost != 0 {
-                    let lane = lost.trailing_zeros() as usize % MOST;
-                    lost &= lost - 1;
-                    let nearest = rest.nearest[at + lane];
-                    let free = if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 };
-                    alone.push(Alone { at: numbers[lane] as u32, free });
+                let again = left & zero.lt(guesses[0]) & !step.unknown;
+                let nearest = L::F::load(&doubts.nearest[at..]);
+                let tries = L::I::select(open, tries, none);
+                rest.add::<L>(&Pixels { place, nearest, guesses, tries }, again);
+                let done = left & !again;
+                if done.any() {
+                    let sky = done & guesses[0].eq(L::F::splat(SKY)) & !step.unknown;
+                    zero.scatter(inverse_depth, places, sky);
+                    lose::<L>(places, nearest, done & !sky, alone);
                 }
             }
+            doubts.count = 0;
+            std::mem::swap(doubts, rest);
         }
-        rest.count = 0;
     }
 
     /// Places of pixels in the region.
@@ -189,48 +171,23 @@ impl Columns<'_, '_> {
         row.times(L::I::splat(self.region.width as i32)) + column
     }
 
-    #[inline(always)]
-    fn sights<L: Lanes>(&self, frame: &Frame, [x, y]: [L::I; 2]) -> Sights<L> {
-        let half = L::F::splat(0.5);
-        let (u, v) = (x.to_floats() + half, y.to_floats() + half);
-        let mut ray = [u; 3];
-        for n in 0..3 {
-            let change =
-                u * L::F::splat(frame.minor[n] as f32) + v * L::F::splat(frame.major[n] as f32);
-            ray[n] = L::F::splat(frame.corner[n] as f32) + change;
-        }
-        let across = ray[0] * ray[0] + ray[1] * ray[1];
-        // The tolerance as a length at depth 1: |ray| / focal.
-        let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
-        let allowed = L::F::splat((allowed * allowed) as f32) * (across + ray[2] * ray[2]);
-        Sights { ray, across, allowed }
-    }
-
-    /// Moves guesses along rays until they are on the surface, where it faces the camera.
-    /// Returns which have got there, and which came to a tile that is not loaded.
-    #[inline(always)]
-    fn settle<L: Lanes>(&self, sights: &Sights<L>, guess: L::F, lanes: L::M) -> (L::F, L::M, L::M) {
-        let (mut answer, mut sure, mut left) = (guess, L::M::none(), lanes);
-        let mut unknown = L::M::none();
-        for _ in 0..CORRECTIONS {
-            let step = self.step::<L>(sights, answer, left);
-            answer = L::F::select(left, step.answer, answer);
-            sure = sure | step.sure;
-            unknown = unknown | step.unknown;
-            left = step.open;
-            if !left.any() {
-                break;
-            }
-        }
-        (answer, sure, unknown)
-    }
-
     /// Compares guesses with the surface, and moves them to where their rays meet the tangent
     /// plane. That is the surface if it is in the same cell and this bends little between.
     #[inline(always)]
-    fn step<L: Lanes>(&self, sights: &Sights<L>, guess: L::F, lanes: L::M) -> Step<L> {
-        let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-        let Sights { ray: [x, y, z], across, allowed } = *sights;
+    fn step<L: Lanes>(&self, frame: &Frame, pixel: [L::I; 2], guess: L::F, lanes: L::M) -> Step<L> {
+        let (zero, one, half) = (L::F::splat(0.0), L::F::splat(1.0), L::F::splat(0.5));
+        let (right, down) = (pixel[0].to_floats() + half, pixel[1].to_floats() + half);
+        let mut ray = [zero; 3];
+        for n in 0..3 {
+            let along_x = right * L::F::splat(frame.minor[n] as f32);
+            let along_y = down * L::F::splat(frame.major[n] as f32);
+            ray[n] = L::F::splat(frame.corner[n] as f32) + (along_x + along_y);
+        }
+        let [x, y, z] = ray;
+        let across = x * x + y * y;
+        // The square of what the tolerance allows at a depth of 1, where it is |ray| / focal.
+        let allowed = ALLOWED * (self.tolerance_px / self.camera.focal_px());
+        let allowed = L::F::splat((allowed * allowed) as f32) * (across + z * z);
         let depth = one.div(guess);
         let ground = self.relief.surface::<L>([x * depth, y * depth], lanes);
         let curvature = self.relief.curvature as f32;
@@ -265,5 +222,21 @@ impl Columns<'_, '_> {
             unknown: lanes & ground.absent,
             answer: L::F::select(near & !reached, guess, answer),
         }
+    }
+}
+
+/// Gives pixels rays of their own.
+#[inline(always)]
+fn lose<L: Lanes>(places: L::I, nearest: L::F, lanes: L::M, alone: &mut Vec<Alone>) {
+    let (mut numbers, mut inverses) = ([0; MOST], [0.0; MOST]);
+    places.store(&mut numbers);
+    nearest.store(&mut inverses);
+    let mut bits = lanes.bits();
+    while bits != 0 {
+        let lane = bits.trailing_zeros() as usize % MOST;
+        bits &= bits - 1;
+        let nearest = inverses[lane];
+        let free = if nearest > 0.0 { SHARE_FREE / nearest } else { 0.0 };
+        alone.push(Alone { at: numbers[lane] as u32, free });
     }
 }
