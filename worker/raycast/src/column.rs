@@ -28,8 +28,9 @@ use crate::seen::Seen;
 use crate::walk::{Fineness, Lines, Rows, Walk};
 use doubts::{Doubts, GUESSES, SKY};
 use glam::DVec2;
-use net::{BEHIND, BENT, BROKEN, Bends, Net, OPEN};
+use net::{BEHIND, BENT, BROKEN, Bends, Net, OPEN, Rules, Verdict};
 pub(crate) use net::{TOLD, WHOLE};
+use std::cell::Cell;
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -60,12 +61,46 @@ const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
 const WIDEST_PX: u32 = 256;
 
+/// The most that a thread keeps from region to region: four times what one of 256 by 1080
+/// pixels needs.
+const KEPT_BYTES: usize = 16 << 20;
+
 /// The method for a region of a view.
 pub(crate) struct Columns<'r, 'a> {
     pub relief: &'r Relief<'a>,
     pub camera: &'r Camera,
     pub tolerance_px: f64,
     pub region: Region,
+}
+
+/// What a region needs while it is looked at. A thread keeps it for the next one: fresh
+/// memory would cost a tenth of the time.
+#[derive(Default)]
+struct Room {
+    net: Net,
+    verdict: Verdict,
+    doubts: Doubts,
+    rest: Doubts,
+    alone: Vec<Alone>,
+}
+
+thread_local! {
+    static ROOM: Cell<Option<Box<Room>>> = const { Cell::new(None) };
+}
+
+impl Room {
+    fn take() -> Box<Room> {
+        ROOM.take().unwrap_or_default()
+    }
+
+    /// Keeps it, unless the region was so large that it holds more than [`KEPT_BYTES`].
+    fn give_back(mut self: Box<Room>) {
+        self.alone.clear();
+        let own = self.alone.capacity() * size_of::<Alone>();
+        if self.net.bytes() + self.doubts.bytes() + self.rest.bytes() + own <= KEPT_BYTES {
+            ROOM.set(Some(self));
+        }
+    }
 }
 
 /// A row of pixels, and the lines around them.
@@ -81,8 +116,8 @@ impl Kernel for Columns<'_, '_> {
     fn run<L: Lanes>(self) -> Seen {
         let area = self.region.area() as usize;
         let mut seen = Seen::new(self.region);
-        let (mut net, mut alone) = (Net::new(), Vec::new());
-        let (mut doubts, mut rest) = (Doubts::default(), Doubts::default());
+        let mut room = Room::take();
+        let Room { net, verdict, doubts, rest, alone } = &mut *room;
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
         for by_rows in [true, false] {
@@ -93,15 +128,16 @@ impl Kernel for Columns<'_, '_> {
                     let spans = spans(&frame, &band, &fan, &part);
                     if !spans.iter().all(|span| span.pixels.is_empty()) {
                         let first = band.rows.start.max(part[1].start);
-                        self.cast::<L>(&frame, &fan, first, &spans, &mut net, &mut seen);
+                        let rules = self.cast::<L>(&frame, &fan, first, &spans, net, &mut seen);
                         let filled = spans.iter().zip(first..);
                         for (span, row) in filled.filter(|(span, _)| !span.pixels.is_empty()) {
                             done += span.pixels.len() as u64;
-                            let rows = (row, span.pixels.clone());
-                            self.see::<L>(&frame, &fan, rows, &net, &mut seen, &mut doubts);
+                            net.judge::<L>(fan.ray(row), rules, verdict);
+                            let row = (row, span.pixels.clone());
+                            self.see::<L>(&frame, &fan, row, net, verdict, &mut seen, doubts);
                         }
                         let depths = &mut seen.inverse_depth;
-                        self.decide::<L>(&mut doubts, &mut rest, depths, &mut alone);
+                        self.decide::<L>(&frame, doubts, rest, depths, alone);
                     }
                 }
             }
@@ -123,13 +159,9 @@ impl Kernel for Columns<'_, '_> {
         }
         seen.alone = alone.len() as u64;
         seen.rays += seen.alone;
-        seen.steps += cast_pixels::<L>(
-            self.relief,
-            self.camera,
-            self.region,
-            &alone,
-            &mut seen.inverse_depth,
-        );
+        seen.steps +=
+            cast_pixels::<L>(self.relief, self.camera, self.region, alone, &mut seen.inverse_depth);
+        room.give_back();
         seen
     }
 }
@@ -164,7 +196,8 @@ fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 
 }
 
 impl Columns<'_, '_> {
-    /// Casts the rays that the pixels of some rows lie between.
+    /// Casts the rays that the pixels of some rows lie between. Returns by what these are
+    /// to be judged.
     #[inline(always)]
     fn cast<L: Lanes>(
         &self,
@@ -174,7 +207,7 @@ impl Columns<'_, '_> {
         spans: &[Span],
         net: &mut Net,
         seen: &mut Seen,
-    ) {
+    ) -> Rules {
         let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
         // One more on each side to compare with, and what may come up from below.
         let rising = self.rises(frame, fan);
@@ -186,7 +219,7 @@ impl Columns<'_, '_> {
         let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
         let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
         // Whole vectors are looked at, and twice as much.
-        let width = (end_line - first_line) as usize + 2 * MOST;
+        let width = net::pitch((end_line - first_line) as usize + 2 * MOST);
         net.clear(first_ray, (end_ray - first_ray) as usize, first_line, width);
         for block in (first_line..end_line).step_by(L::N) {
             let end = block + L::N as i32;
@@ -203,7 +236,8 @@ impl Columns<'_, '_> {
             of_change: bends as f32,
             of_depth: (bends / (PARTS * self.camera.focal_px())) as f32,
         };
-        net.compare::<L>(bends, rising, reach as usize);
+        net.find_tips::<L>(rising);
+        Rules { bends, rising, reach: reach as usize }
     }
 
     /// Whether the rays of a line rise from row to row of a band.
@@ -248,7 +282,7 @@ impl Columns<'_, '_> {
         let (low, high) = (rays.start, rays.end - 1);
         let onwards = tangent(low) <= tangent(high);
         let (begin, step) = if onwards { (low, 1) } else { (high, -1) };
-        let at = (begin - net.first_row) * net.width as i32 + (first - net.first_line);
+        let at = net.place(begin, first);
         let mut places = [0; MOST];
         for (place, lane) in places.iter_mut().zip(0..) {
             *place = at + lane;
@@ -285,13 +319,15 @@ impl Columns<'_, '_> {
         fan: &Fan,
         (row, pixels): (u32, Range<u32>),
         net: &Net,
+        verdict: &Verdict,
         seen: &mut Seen,
         doubts: &mut Doubts,
     ) {
         let d = f64::from(row) + 0.5 - fan.reference;
         let scale = 1.0 / (1.0 + d * fan.q) / fan.spacing;
         let start = L::F::splat((d * fan.r * scale - 0.5) as f32);
-        let [answers, states, tips] = net.row(fan.ray(row));
+        let answers = net.row(fan.ray(row));
+        let (states, tips) = (&verdict.states[..net.width], &verdict.tips[..net.width]);
         let numbers = L::F::load(&NUMBERS);
         let first_line = L::I::splat(net.first_line);
         let sparse = scale < DENSEST;
@@ -339,14 +375,14 @@ impl Columns<'_, '_> {
                 }
             }
             if doubtful.any() {
-                let mut guesses = [answer, L::F::splat(0.0), L::F::splat(0.0)];
+                let (mut guess, mut others) = (answer, None);
                 if (doubtful & L::F::splat(BROKEN).le(state)).any() {
                     let (tip, beside) = gathered::<L>(tips, left);
-                    guesses = torn::<L>([a, b], answer, tip.max(beside), state);
+                    let guesses = torn::<L>([a, b], answer, tip.max(beside), state);
+                    (guess, others) = (guesses[0], Some([guesses[1], guesses[2]]));
                 }
-                let (minor, major) = (minor.truncate(), L::I::splat(row as i32));
-                let place = if frame.by_rows { [minor, major] } else { [major, minor] };
-                doubts.push::<L>(place, guesses, doubtful);
+                let place = [minor.truncate(), L::I::splat(row as i32)];
+                doubts.push::<L>(place, guess, others, doubtful);
             }
         }
     }

@@ -71,9 +71,8 @@ pub(crate) trait Floats:
     /// Each lane in `mask` into its element of a table. An index outside the table writes
     /// to its end.
     fn scatter(self, table: &mut [f32], at: Self::I, mask: Self::M);
-    /// The lanes in `mask`, in their order, into the first places of a slice. What is behind
-    /// them in its first N places may change; panics if there are fewer.
-    fn pack(self, values: &mut [f32], mask: Self::M);
+    /// The lanes in `mask`, in their order, and behind them any values.
+    fn pack(self, mask: Self::M) -> Self;
 }
 
 /// One f64 a lane.
@@ -123,7 +122,7 @@ pub(crate) trait Ints:
     fn load(values: &[i32]) -> Self;
     fn store(self, values: &mut [i32]);
     /// As [`Floats::pack`].
-    fn pack(self, values: &mut [i32], mask: Self::M);
+    fn pack(self, mask: Self::M) -> Self;
     /// The three low bytes of each lane, one lane's behind the other's, into the first 3 N
     /// places of a slice; panics if there are fewer.
     fn store_threes(self, bytes: &mut [u8]);
@@ -336,8 +335,8 @@ mod tests {
                 let wanted: Vec<i32> =
                     (0..L::N).filter(|n| bits >> n & 1 == 1).map(|n| numbers[n]).collect();
                 let (mut ints, mut floats) = ([0; MOST], [0.0; MOST]);
-                lanes.pack(&mut ints, L::M::from_bits(bits));
-                lanes.to_floats().pack(&mut floats, L::M::from_bits(bits));
+                lanes.pack(L::M::from_bits(bits)).store(&mut ints);
+                lanes.to_floats().pack(L::M::from_bits(bits)).store(&mut floats);
                 assert_eq!(ints[..wanted.len()], wanted);
                 assert_eq!(floats.map(|float| float as i32)[..wanted.len()], wanted);
             }

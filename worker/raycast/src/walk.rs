@@ -203,7 +203,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let mut turn = 0;
         loop {
             loop {
-                while self.ready.any() {
+                if self.ready.any() {
                     self.answer(&soil, met);
                 }
                 if !self.split.any() {
@@ -235,27 +235,41 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             }
         }
         while self.unsure.any() {
-            self.emit(L::F::splat(f32::NAN), self.unsure, met);
+            let at = self.rows.at + self.row.times(L::I::splat(self.rows.pitch));
+            L::F::splat(f32::NAN).scatter(met, at, self.unsure);
+            self.row = self.row + L::I::splat(1);
             self.unsure = self.unsure & self.row.lt(L::I::splat(self.rows.count));
         }
     }
 
-    /// Answers the rays that meet their stretches. Those behind them may meet these too.
+    /// Answers the rays that meet their stretches, and those behind them that do, too.
     #[inline(always)]
     fn answer(&mut self, soil: &Soils, met: &mut [f32]) {
-        let ready = self.ready;
-        let answer = self.stretch.contact(self.rise, self.across);
-        // Coarse cells may reach beyond the layer, where there is nothing to meet.
-        let inside = ready & (self.across * self.last).lt(answer);
-        let answer = if self.fineness.apart > 0.0 { soil.marked::<L>(answer) } else { answer };
-        self.emit(answer, inside, met);
-        (self.rise, self.across) = self.rows.ray(self.row);
-        let more = inside & self.row.lt(L::I::splat(self.rows.count));
-        let done = ready & !more;
-        self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
-        self.split = self.split & !done;
+        let (one, count) = (L::I::splat(1), L::I::splat(self.rows.count));
+        let pitch = L::I::splat(self.rows.pitch);
+        let mut ready = self.ready;
         self.steps.passed = L::I::select(ready, L::I::splat(0), self.steps.passed);
-        self.ready = more & self.stretch.is_met(self.rise, self.across);
+        let mut at = self.rows.at + self.row.times(pitch);
+        let mut done = L::M::none();
+        while ready.any() {
+            let answer = self.stretch.contact(self.rise, self.across);
+            // Coarse cells may reach beyond the layer, where there is nothing to meet.
+            let inside = ready & (self.across * self.last).lt(answer);
+            let answer = if self.fineness.apart > 0.0 { soil.marked::<L>(answer) } else { answer };
+            let answer = L::F::select(self.unsure, L::F::splat(f32::NAN), answer);
+            answer.scatter(met, at, inside);
+            at = at + pitch;
+            self.row = L::I::select(inside, self.row + one, self.row);
+            (self.rise, self.across) = self.rows.ray(self.row);
+            let more = inside & self.row.lt(count);
+            done = done | (ready & !more);
+            ready = more & self.stretch.is_met(self.rise, self.across);
+        }
+        if done.any() {
+            self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
+            self.split = self.split & !done;
+        }
+        self.ready = ready;
     }
 
     /// Takes lanes to the next vertices within their cells.
@@ -268,16 +282,6 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         self.stretch.reach(self.relief, s, height, lanes);
         self.ready = lanes & self.stretch.is_met(self.rise, self.across);
         self.split = lanes & self.profile.is_cut();
-    }
-
-    /// Writes the answers of lanes; these go on with their next rays.
-    #[inline(always)]
-    fn emit(&mut self, answer: L::F, lanes: L::M, met: &mut [f32]) {
-        let at = self.rows.at + self.row.times(L::I::splat(self.rows.pitch));
-        let answer = L::F::select(self.unsure, L::F::splat(f32::NAN), answer);
-        answer.scatter(met, at, lanes);
-        let next = self.row + L::I::splat(1);
-        self.row = L::I::select(lanes, next, self.row);
     }
 
     /// Finds the tiles of plots that lanes have come to. Returns the lanes that now seek in

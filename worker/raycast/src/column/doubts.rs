@@ -19,9 +19,9 @@ const SHARE_FREE: f32 = 0.9;
 pub(super) struct Doubts {
     /// How many there are. The lists are longer: whole vectors are written and read.
     count: usize,
-    /// Column and row in the picture.
-    x: Vec<i32>,
-    y: Vec<i32>,
+    /// Places in the picture along the rows of the frame and across.
+    minor: Vec<i32>,
+    major: Vec<i32>,
     /// One over the least depth at which they may be.
     nearest: Vec<f32>,
     /// One over the depths at which they may be, in the order in which they are tried; 0
@@ -56,32 +56,57 @@ struct Pixels<L: Lanes> {
 }
 
 impl Doubts {
-    /// Adds pixels whose first guess is the closest one.
+    /// Adds pixels of a row, by their place along it. The first guess is the closest one; the
+    /// others are for those pixels that may need them.
     #[inline(always)]
-    pub fn push<L: Lanes>(&mut self, place: [L::I; 2], guesses: [L::F; GUESSES], lanes: L::M) {
-        let (nearest, tries) = (guesses[0], L::I::splat(0));
-        self.add::<L>(&Pixels { place, nearest, guesses, tries }, lanes);
+    pub fn push<L: Lanes>(
+        &mut self,
+        [minor, major]: [L::I; 2],
+        guess: L::F,
+        others: Option<[L::F; 2]>,
+        lanes: L::M,
+    ) {
+        let at = self.count;
+        self.reserve(at + MOST);
+        let (zero, guess) = (L::F::splat(0.0), guess.pack(lanes));
+        let [mut second, mut third] = [zero; 2];
+        if let Some(others) = others {
+            (second, third) = (others[0].pack(lanes), others[1].pack(lanes));
+        }
+        minor.pack(lanes).store(&mut self.minor[at..]);
+        major.store(&mut self.major[at..]);
+        guess.store(&mut self.nearest[at..]);
+        for (list, guess) in self.guesses.iter_mut().zip([guess, second, third]) {
+            guess.store(&mut list[at..]);
+        }
+        L::I::splat(0).store(&mut self.tries[at..]);
+        self.count = at + lanes.count() as usize;
     }
 
     #[inline(always)]
     fn add<L: Lanes>(&mut self, pixels: &Pixels<L>, lanes: L::M) {
         let at = self.count;
         self.reserve(at + MOST);
-        let [x, y] = pixels.place;
-        x.pack(&mut self.x[at..], lanes);
-        y.pack(&mut self.y[at..], lanes);
-        pixels.nearest.pack(&mut self.nearest[at..], lanes);
-        for n in 0..GUESSES {
-            pixels.guesses[n].pack(&mut self.guesses[n][at..], lanes);
+        let [minor, major] = pixels.place;
+        minor.pack(lanes).store(&mut self.minor[at..]);
+        major.pack(lanes).store(&mut self.major[at..]);
+        pixels.nearest.pack(lanes).store(&mut self.nearest[at..]);
+        for (list, guess) in self.guesses.iter_mut().zip(pixels.guesses) {
+            guess.pack(lanes).store(&mut list[at..]);
         }
-        pixels.tries.pack(&mut self.tries[at..], lanes);
+        pixels.tries.pack(lanes).store(&mut self.tries[at..]);
         self.count = at + lanes.count() as usize;
+    }
+
+    /// What it holds.
+    pub fn bytes(&self) -> usize {
+        (GUESSES + 4) * self.minor.capacity() * size_of::<i32>()
     }
 
     /// Makes the lists so long at least.
     #[inline(always)]
     fn reserve(&mut self, length: usize) {
-        if self.x.len() < length {
+        if self.minor.len() < length {
             self.grow(length);
         }
     }
@@ -90,8 +115,8 @@ impl Doubts {
     #[inline(never)]
     fn grow(&mut self, length: usize) {
         let length = (2 * length).next_multiple_of(MOST);
-        self.x.resize(length, 0);
-        self.y.resize(length, 0);
+        self.minor.resize(length, 0);
+        self.major.resize(length, 0);
         self.tries.resize(length, 0);
         for list in self.guesses.iter_mut().chain([&mut self.nearest]) {
             list.resize(length, 0.0);
@@ -100,7 +125,7 @@ impl Doubts {
 
     #[inline(always)]
     fn place<L: Lanes>(&self, at: usize) -> [L::I; 2] {
-        [L::I::load(&self.x[at..]), L::I::load(&self.y[at..])]
+        [L::I::load(&self.minor[at..]), L::I::load(&self.major[at..])]
     }
 
     /// The lanes from `at` on that are pixels. The others are pixels that were here before.
@@ -119,20 +144,20 @@ impl Columns<'_, '_> {
     #[inline(always)]
     pub(super) fn decide<L: Lanes>(
         &self,
+        frame: &Frame,
         doubts: &mut Doubts,
         rest: &mut Doubts,
         inverse_depth: &mut [f32],
         alone: &mut Vec<Alone>,
     ) {
-        let frame = Frame::new(self.camera, true);
         let (zero, none) = (L::F::splat(0.0), L::I::splat(0));
         while doubts.count > 0 {
             doubts.reserve(doubts.count + MOST);
             for at in (0..doubts.count).step_by(L::N) {
                 let (place, lanes) = (doubts.place::<L>(at), doubts.lanes::<L>(at));
                 let guess = L::F::load(&doubts.guesses[0][at..]);
-                let step = self.step::<L>(&frame, place, guess, lanes & zero.lt(guess));
-                let places = self.places::<L>(place);
+                let step = self.step::<L>(frame, place, guess, lanes & zero.lt(guess));
+                let places = self.places::<L>(frame, place);
                 step.answer.scatter(inverse_depth, places, step.sure);
                 let left = lanes & !step.sure;
                 if !left.any() {
@@ -165,7 +190,8 @@ impl Columns<'_, '_> {
 
     /// Places of pixels in the region.
     #[inline(always)]
-    fn places<L: Lanes>(&self, [x, y]: [L::I; 2]) -> L::I {
+    fn places<L: Lanes>(&self, frame: &Frame, [minor, major]: [L::I; 2]) -> L::I {
+        let (x, y) = if frame.by_rows { (minor, major) } else { (major, minor) };
         let row = y - L::I::splat(self.region.y as i32);
         let column = x - L::I::splat(self.region.x as i32);
         row.times(L::I::splat(self.region.width as i32)) + column
@@ -176,12 +202,12 @@ impl Columns<'_, '_> {
     #[inline(always)]
     fn step<L: Lanes>(&self, frame: &Frame, pixel: [L::I; 2], guess: L::F, lanes: L::M) -> Step<L> {
         let (zero, one, half) = (L::F::splat(0.0), L::F::splat(1.0), L::F::splat(0.5));
-        let (right, down) = (pixel[0].to_floats() + half, pixel[1].to_floats() + half);
+        let (minor, major) = (pixel[0].to_floats() + half, pixel[1].to_floats() + half);
         let mut ray = [zero; 3];
         for n in 0..3 {
-            let along_x = right * L::F::splat(frame.minor[n] as f32);
-            let along_y = down * L::F::splat(frame.major[n] as f32);
-            ray[n] = L::F::splat(frame.corner[n] as f32) + (along_x + along_y);
+            let along = minor * L::F::splat(frame.minor[n] as f32);
+            let across = major * L::F::splat(frame.major[n] as f32);
+            ray[n] = L::F::splat(frame.corner[n] as f32) + (along + across);
         }
         let [x, y, z] = ray;
         let across = x * x + y * y;

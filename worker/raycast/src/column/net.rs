@@ -22,6 +22,8 @@ pub(crate) const WHOLE: i32 = 2;
 /// ... posts are further apart there than rays.
 pub(crate) const TOLD: i32 = 1;
 
+/// Answers in a line of the cache.
+const LINE: usize = 16;
 /// How many times more answers must bend than straight lines may, for two rays to see
 /// different ground.
 const TORN: f32 = 8.0;
@@ -43,89 +45,96 @@ pub(super) struct Bends {
     pub of_depth: f32,
 }
 
+/// By what the pixels between rays are judged.
+#[derive(Clone, Copy)]
+pub(super) struct Rules {
+    pub bends: Bends,
+    /// Rays are lower in the row before, not in the next one.
+    pub rising: bool,
+    /// How many rows lower ground is looked for that may come up between rays.
+    pub reach: usize,
+}
+
 /// The answers of rays, row by row, in each line by line.
+#[derive(Default)]
 pub(super) struct Net {
     /// One over the depths; 0 for the sky, NaN where a tile is missing. The last two bits
     /// are [`WHOLE`] and [`TOLD`].
     pub answers: Vec<f32>,
-    /// By the left of two answers [`EVEN`] and so on.
-    states: Vec<f32>,
-    /// How much each answer and those beside it bend.
-    bends: Vec<f32>,
-    /// Answers behind which there is other ground, if beside them it has ended already, so
-    /// that it may come to a peak between rays; else 0. And whether a row has any.
-    ends: Vec<f32>,
-    peaked: Vec<bool>,
-    /// The closest ground that ends in a row, or comes to a peak a little lower.
+    /// Where the first row begins: at a line of the cache.
+    start: usize,
+    /// Closer ground that ends a row lower, else 0; of rows that have any ...
     tips: Vec<f32>,
+    tipped: Vec<bool>,
+    /// ... and such ground if beside it it has ended already, so that it may come to a peak
+    /// between rays.
+    peaks: Vec<f32>,
+    peaked: Vec<bool>,
     /// Answers of a row.
     pub width: usize,
     pub first_row: i32,
     pub first_line: i32,
 }
 
+/// What is known of the pixels of a row.
+#[derive(Default)]
+pub(super) struct Verdict {
+    /// By the left of two answers [`EVEN`] and so on.
+    pub states: Vec<f32>,
+    /// The closest ground that ends in the row, or comes to a peak a little lower.
+    pub tips: Vec<f32>,
+    /// How much each answer and those beside it bend.
+    bends: Vec<f32>,
+}
+
 impl Net {
-    pub fn new() -> Self {
-        Net {
-            answers: Vec::new(),
-            states: Vec::new(),
-            bends: Vec::new(),
-            ends: Vec::new(),
-            peaked: Vec::new(),
-            tips: Vec::new(),
-            width: 0,
-            first_row: 0,
-            first_line: 0,
-        }
-    }
-
-    /// Room for rays that have found nothing.
+    /// Room for rays that have found nothing; `width` is that of [`pitch`].
     pub fn clear(&mut self, first_row: i32, rows: usize, first_line: i32, width: usize) {
-        self.answers.clear();
-        self.answers.resize(width * rows, 0.0);
         (self.first_row, self.first_line, self.width) = (first_row, first_line, width);
-    }
-
-    /// A row: its answers, what is known of the pixels between them, and the closest ground
-    /// that ends a little lower.
-    #[inline(always)]
-    pub fn row(&self, row: i32) -> [&[f32]; 3] {
-        let at = (row - self.first_row) as usize * self.width;
-        let end = at + self.width;
-        [&self.answers[at..end], &self.states[at..end], &self.tips[at..end]]
-    }
-
-    /// Finds out what is known of the pixels, once all rays are cast. Rays are lower in the
-    /// next row, or with `rising` in the one before; `reach` rows lower are looked at for
-    /// ground that may come up between rays.
-    ///
-    /// Between two rays the ground is a line as far as it does not bend. Where it bends by
-    /// s in one place, t of the way from ray to ray, the answers bend by (1 - t) s at the one
-    /// and by t s at the other, and the line is off by at most t (1 - t) s: their product over
-    /// their sum. Where it bends evenly, or in more places to the same side, it is off by
-    /// less. It counts in pixels, by the change of the answers from row to row, or by what
-    /// they are. Bends to both sides can hide each other at a ray, hence [`MOST_BENT`].
-    #[inline(always)]
-    pub fn compare<L: Lanes>(&mut self, allowed: Bends, rising: bool, reach: usize) {
-        let Net { answers, states, bends, ends, tips, peaked, width, .. } = self;
-        let (width, count) = (*width, answers.len());
-        // A margin for the vectors beyond the end.
-        answers.resize(count + 2 * MOST, 0.0);
-        for list in [&mut *states, &mut *bends, &mut *ends, &mut *tips] {
+        // Besides what is lost by the start, a margin for the vectors beyond the end.
+        let count = width * rows + LINE + 2 * MOST;
+        self.answers.clear();
+        self.answers.resize(count, 0.0);
+        self.start = self.answers.as_ptr().align_offset(LINE * size_of::<f32>()) % LINE;
+        for list in [&mut self.tips, &mut self.peaks] {
+            list.resize(count, 0.0);
+        }
+        for list in [&mut self.tipped, &mut self.peaked] {
             list.clear();
-            list.resize(count + 2 * MOST, 0.0);
+            list.resize(rows, false);
         }
+    }
+
+    /// What it holds, apart from a few values a row.
+    pub fn bytes(&self) -> usize {
+        let lists = [&self.answers, &self.tips, &self.peaks];
+        lists.iter().map(|list| list.capacity() * size_of::<f32>()).sum()
+    }
+
+    fn rows(&self) -> usize {
+        self.tipped.len()
+    }
+
+    /// Where the answer of a ray of a line belongs.
+    pub fn place(&self, row: i32, line: i32) -> i32 {
+        let row = (row - self.first_row) * self.width as i32;
+        self.start as i32 + row + (line - self.first_line)
+    }
+
+    /// The answers of a row.
+    #[inline(always)]
+    pub fn row(&self, row: i32) -> &[f32] {
+        let at = self.start + (row - self.first_row) as usize * self.width;
+        &self.answers[at..at + self.width]
+    }
+
+    /// Looks for ground behind which there is other ground, once all rays are cast.
+    #[inline(always)]
+    pub fn find_tips<L: Lanes>(&mut self, rising: bool) {
+        let Net { answers, start, tips, tipped, peaks, peaked, width, .. } = self;
+        let (width, rows, answers) = (*width, tipped.len(), &answers[*start..]);
         let load = |at: usize| L::F::load(&answers[at..]);
-        // The first has none beside it.
-        for at in (1..count).step_by(L::N) {
-            let here = load(at);
-            let bend = (load(at - 1) - (here + here) + load(at + 1)).abs();
-            bend.store(&mut bends[at..]);
-        }
         let (zero, neighbours) = (L::F::splat(0.0), L::F::splat(1.0 - NEIGHBOURS));
-        let rows = count / width.max(1);
-        peaked.clear();
-        peaked.resize(rows, false);
         for row in 0..rows {
             let (Some(below), Some(lower)) =
                 (below(row, 1, rows, rising), below(row, 2, rows, rising))
@@ -138,66 +147,117 @@ impl Net {
                 let before = (load(lower + column) - ground).abs();
                 let ending =
                     here.lt(ground * neighbours) & (before * L::F::splat(ENDS)).lt(ground - here);
-                if ending.any() {
-                    let beside = load(below + column - 1).min(load(below + column + 1));
-                    let level = (ground * neighbours).le(beside);
-                    let at = row_at + column;
-                    L::F::select(ending, ground, zero).store(&mut tips[at..]);
-                    let peak = ending & !level;
-                    L::F::select(peak, ground, zero).store(&mut ends[at..]);
-                    peaked[row] |= peak.any();
-                }
-            }
-        }
-        for row in 0..rows {
-            for lower in 0..reach {
-                let Some(peak) = below(row, lower, rows, rising).filter(|&row| peaked[row]) else {
+                if !ending.any() {
                     continue;
-                };
-                let (row_at, peak) = (row * width, peak * width);
-                for column in (0..width).step_by(L::N) {
-                    let ends = L::F::load(&ends[peak + column..]);
-                    let closest = L::F::load(&tips[row_at + column..]).max(ends);
-                    closest.store(&mut tips[row_at + column..]);
                 }
-            }
-        }
-        let of_change = L::F::splat(allowed.of_change);
-        let of_depth = L::F::splat(allowed.of_depth);
-        let told = L::I::splat(TOLD);
-        let (flat, uneven) = (L::F::splat(EVEN), L::F::splat(BENT));
-        let (broken, behind) = (L::F::splat(BROKEN), L::F::splat(BEHIND));
-        let open = L::F::splat(OPEN);
-        for row in (0..count).step_by(width.max(1)) {
-            // The rows beside this one, or one of them twice.
-            let after = if row + width < count { row + width } else { row.saturating_sub(width) };
-            let before = if row > 0 { row - width } else { after };
-            for column in (0..width).step_by(L::N) {
-                let (here, before, after) = (row + column, before + column, after + column);
-                let (a, b) = (load(here), load(here + 1));
-                let (low, high) = (a.min(b), a.max(b));
-                let same = same::<L>(a, b);
-                let (bend_a, bend_b) = (L::F::load(&bends[here..]), L::F::load(&bends[here + 1..]));
-                let bend = bend_a.max(bend_b);
-                let around = (load(before) + load(before + 1)) + (load(after) + load(after + 1));
-                let known = bend_a + bend_b + around;
-                let change = (a - load(before)).abs().min((b - load(before + 1)).abs());
-                let change = change.min((a - load(after)).abs().min((b - load(after + 1)).abs()));
-                let even = (change * of_change).max(low * of_depth);
-                let told = (a.to_bits() & b.to_bits() & told).eq(told);
-                let same = same & bend.le(even * L::F::splat(TORN)) | high.eq(zero);
-                let off = (bend_a * bend_b).le(even * L::F::splat(0.5) * (bend_a + bend_b));
-                let straight = off & bend.le(even * L::F::splat(MOST_BENT));
-                let even = (told & straight) | high.eq(zero);
-                let tip = L::F::load(&tips[here..]).max(L::F::load(&tips[here + 1..]));
-                let state = L::F::select(even, flat, uneven);
-                let state = L::F::select(same, state, broken);
-                let state = L::F::select(high.lt(tip * neighbours), behind, state);
-                let state = L::F::select(known.eq(known), state, open);
-                state.store(&mut states[here..]);
+                if !tipped[row] {
+                    tips[row_at..row_at + width].fill(0.0);
+                    tipped[row] = true;
+                }
+                let at = row_at + column;
+                L::F::select(ending, ground, zero).store(&mut tips[at..]);
+                let beside = load(below + column - 1).min(load(below + column + 1));
+                let peak = ending & !(ground * neighbours).le(beside);
+                if peak.any() {
+                    if !peaked[row] {
+                        peaks[row_at..row_at + width].fill(0.0);
+                        peaked[row] = true;
+                    }
+                    L::F::select(peak, ground, zero).store(&mut peaks[at..]);
+                }
             }
         }
     }
+
+    /// Finds out what is known of the pixels of a row.
+    ///
+    /// Between two rays the ground is a line as far as it does not bend. Where it bends by
+    /// s in one place, t of the way from ray to ray, the answers bend by (1 - t) s at the one
+    /// and by t s at the other, and the line is off by at most t (1 - t) s: their product over
+    /// their sum. Where it bends evenly, or in more places to the same side, it is off by
+    /// less. It counts in pixels, by the change of the answers from row to row, or by what
+    /// they are. Bends to both sides can hide each other at a ray, hence [`MOST_BENT`].
+    #[inline(always)]
+    pub fn judge<L: Lanes>(&self, row: i32, rules: Rules, verdict: &mut Verdict) {
+        let width = self.width;
+        let Verdict { states, tips, bends } = verdict;
+        for list in [&mut *states, tips, bends] {
+            list.resize(width + 2 * MOST, 0.0);
+        }
+        let row = (row - self.first_row) as usize;
+        self.find_closest::<L>(row, rules, tips);
+        // The rows beside this one, or one of them twice.
+        let rows = self.rows();
+        let after = if row + 1 < rows { row + 1 } else { row.saturating_sub(1) };
+        let before = if row > 0 { row - 1 } else { after };
+        let answers = &self.answers[self.start..];
+        let [before, row, after] = [before, row, after].map(|row| &answers[row * width..]);
+        for column in (1..width).step_by(L::N) {
+            let here = L::F::load(&row[column..]);
+            let beside = L::F::load(&row[column - 1..]) + L::F::load(&row[column + 1..]);
+            (beside - (here + here)).abs().store(&mut bends[column..]);
+        }
+        let (zero, half) = (L::F::splat(0.0), L::F::splat(0.5));
+        let of_change = L::F::splat(rules.bends.of_change);
+        let of_depth = L::F::splat(rules.bends.of_depth);
+        let told = L::I::splat(TOLD);
+        let (flat, uneven) = (L::F::splat(EVEN), L::F::splat(BENT));
+        let (broken, behind) = (L::F::splat(BROKEN), L::F::splat(BEHIND));
+        let neighbours = L::F::splat(1.0 - NEIGHBOURS);
+        for column in (0..width).step_by(L::N) {
+            let (a, b) = (L::F::load(&row[column..]), L::F::load(&row[column + 1..]));
+            let (low, high) = (a.min(b), a.max(b));
+            let bend_a = L::F::load(&bends[column..]);
+            let bend_b = L::F::load(&bends[column + 1..]);
+            let before = [L::F::load(&before[column..]), L::F::load(&before[column + 1..])];
+            let after = [L::F::load(&after[column..]), L::F::load(&after[column + 1..])];
+            let change = (a - before[0]).abs().min((b - before[1]).abs());
+            let change = change.min((a - after[0]).abs().min((b - after[1]).abs()));
+            let even = (change * of_change).max(low * of_depth);
+            let told = (a.to_bits() & b.to_bits() & told).eq(told);
+            let sky = high.eq(zero);
+            let bend = bend_a.max(bend_b);
+            let same = same::<L>(a, b) & bend.le(even * L::F::splat(TORN)) | sky;
+            let off = (bend_a * bend_b).le(even * half * (bend_a + bend_b));
+            let straight = off & bend.le(even * L::F::splat(MOST_BENT));
+            let state = L::F::select((told & straight) | sky, flat, uneven);
+            let state = L::F::select(same, state, broken);
+            let tip = L::F::load(&tips[column..]).max(L::F::load(&tips[column + 1..]));
+            let state = L::F::select(high.lt(tip * neighbours), behind, state);
+            // Of what is NaN, any sum is.
+            let known = bend_a + bend_b + (before[0] + before[1]) + (after[0] + after[1]);
+            let state = L::F::select(known.eq(known), state, L::F::splat(OPEN));
+            state.store(&mut states[column..]);
+        }
+    }
+
+    /// The closest ground that ends in a row, or comes to a peak a little lower.
+    #[inline(always)]
+    fn find_closest<L: Lanes>(&self, row: usize, rules: Rules, closest: &mut [f32]) {
+        let width = self.width;
+        if self.tipped[row] {
+            closest[..width].copy_from_slice(&self.tips[row * width..(row + 1) * width]);
+        } else {
+            closest[..width].fill(0.0);
+        }
+        for lower in 0..rules.reach {
+            let Some(peak) = below(row, lower, self.rows(), rules.rising) else { break };
+            if !self.peaked[peak] {
+                continue;
+            }
+            let peaks = &self.peaks[peak * width..];
+            for column in (0..width).step_by(L::N) {
+                let found = L::F::load(&closest[column..]).max(L::F::load(&peaks[column..]));
+                found.store(&mut closest[column..]);
+            }
+        }
+    }
+}
+
+/// How many answers there are to be in a row for so many lines: whole lines of the cache, an
+/// odd number of them, or rays one behind another would meet in few of its sets.
+pub(super) fn pitch(lines: usize) -> usize {
+    (lines.div_ceil(LINE) | 1) * LINE
 }
 
 /// Whether two answers are of the same ground.

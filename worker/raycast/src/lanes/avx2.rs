@@ -187,9 +187,9 @@ impl Floats for F {
         }
     }
     #[inline(always)]
-    fn pack(self, values: &mut [f32], mask: M) {
+    fn pack(self, mask: M) -> F {
         // SAFETY: see the page of this module.
-        unsafe { F(_mm256_permutevar8x32_ps(self.0, packed(mask))).store(values) }
+        unsafe { F(_mm256_permutevar8x32_ps(self.0, packed(mask))) }
     }
 }
 
@@ -212,9 +212,9 @@ impl Ints for I {
         unsafe { _mm256_storeu_si256(values[..8].as_mut_ptr().cast(), self.0) }
     }
     #[inline(always)]
-    fn pack(self, values: &mut [i32], mask: M) {
+    fn pack(self, mask: M) -> I {
         // SAFETY: see the page of this module.
-        unsafe { I(_mm256_permutevar8x32_epi32(self.0, packed(mask))).store(values) }
+        unsafe { I(_mm256_permutevar8x32_epi32(self.0, packed(mask))) }
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {

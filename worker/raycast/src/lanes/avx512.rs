@@ -182,9 +182,9 @@ impl Floats for F {
         }
     }
     #[inline(always)]
-    fn pack(self, values: &mut [f32], mask: M) {
+    fn pack(self, mask: M) -> F {
         // SAFETY: see the page of this module.
-        unsafe { F(_mm512_maskz_compress_ps(mask.0, self.0)).store(values) }
+        unsafe { F(_mm512_maskz_compress_ps(mask.0, self.0)) }
     }
 }
 
@@ -207,9 +207,9 @@ impl Ints for I {
         unsafe { _mm512_storeu_si512(values[..16].as_mut_ptr().cast(), self.0) }
     }
     #[inline(always)]
-    fn pack(self, values: &mut [i32], mask: M) {
+    fn pack(self, mask: M) -> I {
         // SAFETY: see the page of this module.
-        unsafe { I(_mm512_maskz_compress_epi32(mask.0, self.0)).store(values) }
+        unsafe { I(_mm512_maskz_compress_epi32(mask.0, self.0)) }
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {

@@ -146,10 +146,8 @@ impl Floats for F {
         }
     }
     #[inline(always)]
-    fn pack(self, values: &mut [f32], mask: M) {
-        if mask.0 {
-            values[0] = self.0;
-        }
+    fn pack(self, _: M) -> F {
+        self
     }
 }
 
@@ -169,10 +167,8 @@ impl Ints for I {
         values[0] = self.0;
     }
     #[inline(always)]
-    fn pack(self, values: &mut [i32], mask: M) {
-        if mask.0 {
-            values[0] = self.0;
-        }
+    fn pack(self, _: M) -> I {
+        self
     }
     #[inline(always)]
     fn store_threes(self, bytes: &mut [u8]) {
