@@ -134,7 +134,8 @@ impl Kernel for Columns<'_, '_> {
                             done += span.pixels.len() as u64;
                             net.judge::<L>(fan.ray(row), rules, verdict);
                             let row = (row, span.pixels.clone());
-                            self.see::<L>(&frame, &fan, row, net, verdict, &mut seen, doubts);
+                            let known = (&*net, &*verdict);
+                            self.see::<L>(&frame, &fan, row, known, &mut seen, doubts);
                         }
                         let depths = &mut seen.inverse_depth;
                         self.decide::<L>(&frame, doubts, rest, depths, alone);
@@ -318,8 +319,7 @@ impl Columns<'_, '_> {
         frame: &Frame,
         fan: &Fan,
         (row, pixels): (u32, Range<u32>),
-        net: &Net,
-        verdict: &Verdict,
+        (net, verdict): (&Net, &Verdict),
         seen: &mut Seen,
         doubts: &mut Doubts,
     ) {
