@@ -123,30 +123,20 @@ impl Frame {
                 let apart = self.apart(middle(row));
                 if positive { apart > near } else { apart < -near }
             };
-            let (first, end) =
-                match ((0..last).find(|&row| on_side(row)), (0..last).rfind(|&row| on_side(row))) {
-                    (Some(first), Some(end)) => (first, end + 1),
-                    _ => continue,
-                };
+            // Where these begin and end, if there are any: they lie together.
+            let first = if on_side(0) { 0 } else { turn(0..last, |row| !on_side(row)) };
+            let end = if first < last { turn(first..last, on_side) } else { last };
             let mut rest = first..end;
             while !rest.is_empty() {
-                let (low, high) =
-                    (self.apart(middle(rest.start)).abs(), self.apart(middle(rest.end - 1)).abs());
+                let reach = |row: u32| self.apart(middle(row)).abs();
+                let (low, high) = (reach(rest.start), reach(rest.end - 1));
                 let half = CLOSEST * low.max(high);
-                let far_first = low >= high;
-                let inside = |row: &u32| self.apart(middle(*row)).abs() >= half;
-                if far_first {
-                    let cut =
-                        rest.clone().take_while(inside).last().map_or(rest.start, |row| row) + 1;
+                if low >= high {
+                    let cut = turn(rest.clone(), |row| reach(row) >= half).max(rest.start + 1);
                     bands.push(Band { rows: rest.start..cut, falling: false });
                     rest.start = cut;
                 } else {
-                    let cut = rest
-                        .clone()
-                        .rev()
-                        .take_while(inside)
-                        .last()
-                        .map_or(rest.end - 1, |row| row);
+                    let cut = turn(rest.clone(), |row| reach(row) < half).min(rest.end - 1);
                     bands.push(Band { rows: cut..rest.end, falling: true });
                     rest.end = cut;
                 }
@@ -195,6 +185,20 @@ impl Frame {
         }
         if owns(first) { first..last + 1 } else { none }
     }
+}
+
+/// The first of some rows that is not as the ones before it are.
+fn turn(rows: Range<u32>, is: impl Fn(u32) -> bool) -> u32 {
+    let (mut low, mut high) = (rows.start, rows.end);
+    while low < high {
+        let middle = low + (high - low) / 2;
+        if is(middle) {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    low
 }
 
 impl Fan {

@@ -125,8 +125,7 @@ impl Progress {
         self.stats.steps += seen.steps;
         // Each go looks at the whole region: the last one counts.
         self.stats.fallbacks = seen.alone;
-        self.stats.hits +=
-            seen.inverse_depth.iter().map(|&inverse| u64::from(inverse > 0.0)).sum::<u64>();
+        self.stats.hits += number(&seen.inverse_depth, |&inverse| inverse > 0.0);
         let mut shader = Shader::new(field, &view.camera, &view.shading, samples);
         let share = 1.0 / samples as f32;
         let middle = |sample: u32| (sample as f32 + 0.5) * share;
@@ -183,7 +182,7 @@ impl Progress {
             let known = from + start..from + stop;
             self.pixels[3 * known.start..3 * known.end]
                 .copy_from_slice(&strip.pixels[3 * start..3 * stop]);
-            self.left -= self.done[known.clone()].iter().map(|&done| u64::from(!done)).sum::<u64>();
+            self.left -= number(&self.done[known.clone()], |&done| !done);
             self.done[known].fill(true);
             start = stop + 1;
         }
@@ -196,6 +195,12 @@ impl Progress {
         self.done.fill(true);
         self.left = 0;
     }
+}
+
+/// How many of some values are as asked. In small sums, which fit many to a vector.
+fn number<T>(values: &[T], is: impl Fn(&T) -> bool) -> u64 {
+    let few = |values: &[T]| values.iter().map(|value| u8::from(is(value))).sum::<u8>();
+    values.chunks(usize::from(u8::MAX)).map(|values| u64::from(few(values))).sum()
 }
 
 /// Some rows of pixels, shaded.

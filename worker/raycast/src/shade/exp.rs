@@ -22,12 +22,13 @@ pub(crate) fn exp<L: Lanes>(x: L::F) -> L::F {
     let y = x * L::F::splat(std::f32::consts::LOG2_E);
     let n = (y + L::F::splat(0.5)).floor();
     let f = y - n.to_floats();
-    let mut sum = L::F::splat(TERMS[6]);
-    let mut term = 6;
-    while term > 0 {
-        term -= 1;
-        sum = sum * f + L::F::splat(TERMS[term]);
-    }
+    // In pairs (Estrin): as a chain each term would wait for the one before.
+    let [t0, t1, t2, t3, t4, t5, t6] = TERMS;
+    let square = f * f;
+    let low =
+        (L::F::splat(t0) + L::F::splat(t1) * f) + (L::F::splat(t2) + L::F::splat(t3) * f) * square;
+    let high = (L::F::splat(t4) + L::F::splat(t5) * f) + L::F::splat(t6) * square;
+    let sum = low + high * (square * square);
     sum * L::F::from_bits((n + L::I::splat(127)).shl(L::I::splat(23)))
 }
 
