@@ -54,6 +54,34 @@ fn the_core_bench_takes_its_cameras_from_a_flight_and_its_terrain_from_a_store()
 }
 
 #[test]
+fn the_flight_bench_finishes_the_frames_of_the_demo_and_checks_them() {
+    let dir = Dir::new();
+    let report = dir.path("flight.json");
+    let mut command = terrafarm();
+    command.args(["bench", "flight", "--short", "--threads", "3", "--json"]).arg(&report);
+    let text = succeed(&mut command);
+    assert!(text.contains("6 frames of 320 x 180") && text.contains("3 threads"), "{text}");
+    let report = json(&report);
+    assert_eq!((&report["frames"], &report["kept"]), (&6.into(), &true.into()), "{report}");
+    assert_eq!(report["checked"], serde_json::json!([0, 2, 5]));
+    for key in ["frames_per_s", "ns_per_pixel", "error_px_p99"] {
+        assert!(report[key].as_f64().unwrap() > 0.0, "{key} in {report}");
+    }
+}
+
+#[test]
+fn the_flight_bench_flies_over_any_scene() {
+    let world = World::new(100);
+    let [scene, flight] = [&world.scene, &world.flight];
+    let mut command = terrafarm();
+    command.args(["bench", "flight", "--size", "64x36", "--frames", "4", "--repeats", "2"]);
+    let text = succeed(command.args(["--method", "exact"]).arg(scene).arg("--flight").arg(flight));
+    assert!(text.contains("4 frames of 64 x 36, finished, by exact"), "{text}");
+    run(terrafarm().args(["bench", "flight"]).arg(scene), 2);
+    run(terrafarm().args(["bench", "flight", "--tolerance", "0"]), 2);
+}
+
+#[test]
 fn the_chart_of_speed_and_accuracy_has_every_method_and_both_forms() {
     let dir = Dir::new();
     let [report, svg, png] = ["sa.json", "sa.svg", "sa.png"].map(|name| dir.path(name));

@@ -11,6 +11,8 @@ use terrafarm_common::quality::{Method, Quality};
 pub enum Bench {
     /// Speed of the methods on one core, every answer checked
     Core(BenchCore),
+    /// Finished frames a second of this process alone, over a flight
+    Flight(BenchFlight),
     /// Time against error: all methods and settings over procedural and real terrain
     SpeedAccuracy(BenchSpeedAccuracy),
     /// Cost of a frame, and of its terrain in memory, over ever larger terrain on disk
@@ -51,6 +53,41 @@ pub struct BenchCore {
     /// Take the Earth as flat, whatever the store says
     #[arg(long)]
     pub flat: bool,
+    /// Write the report to this file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// `terrafarm bench flight`
+#[derive(Debug, ClapArgs)]
+pub struct BenchFlight {
+    /// Scene file [default: the demo's, over terrain of its own]
+    #[arg(requires = "flight")]
+    pub scene: Option<PathBuf>,
+    /// Flight file, CSV [default: the demo's]
+    #[arg(long, value_name = "CSV", requires = "scene")]
+    pub flight: Option<PathBuf>,
+    /// Size of the picture
+    #[arg(long, value_parser = parse_size, value_name = "WxH", default_value = "1920x1080")]
+    pub size: (u32, u32),
+    /// Frames, spread over the flight [default: 24 a second of it]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
+    /// Threads [default: one a core]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// How rays find the ground [default: the scene's, else auto]
+    #[arg(long, value_parser = parse_method, value_name = "NAME")]
+    pub method: Option<Method>,
+    /// Tolerance of the method, pixels [default: the scene's, else 0.5]
+    #[arg(long, value_parser = parse_tolerance, value_name = "PX", allow_negative_numbers = true)]
+    pub tolerance: Option<f64>,
+    /// Runs, of which the one in the middle counts
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// Small terrain and pictures, for a quick look
+    #[arg(long, conflicts_with_all = ["scene", "size", "frames", "repeats"])]
+    pub short: bool,
     /// Write the report to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

@@ -3,6 +3,7 @@
 //! | command | question | module |
 //! |---|---|---|
 //! | `bench core` | how fast is each method on one core? | `core` |
+//! | `bench flight` | how many finished frames a second does this PC make? | `flight` |
 //! | `bench speed-accuracy` | what does a smaller error cost? | `speed_accuracy`, `chart` |
 //! | `bench terrain-size` | what does a frame cost over ever larger terrain? | `terrain_size` |
 //! | `bench scale-out` | what do more workers bring, and where does the time go? | `scale_out` |
@@ -15,6 +16,7 @@
 mod chart;
 mod clock;
 mod core;
+mod flight;
 mod kernel;
 mod land;
 pub(super) mod report;
@@ -30,6 +32,7 @@ use crate::args;
 pub fn run(args: &args::bench::Bench) -> anyhow::Result<Outcome> {
     match args {
         args::bench::Bench::Core(args) => core::run(args),
+        args::bench::Bench::Flight(args) => flight::run(args),
         args::bench::Bench::SpeedAccuracy(args) => speed_accuracy::run(args),
         args::bench::Bench::TerrainSize(args) => terrain_size::run(args),
         args::bench::Bench::ScaleOut(args) => scale_out::run(args),

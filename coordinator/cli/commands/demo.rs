@@ -11,15 +11,15 @@ use std::path::Path;
 use terrafarm_synth::SynthSpec;
 
 /// Terrain of the demo: the seed was chosen for its lake and its ridge.
-const TERRAIN: SynthSpec = SynthSpec { posts: 2049, spacing_m: 15.0, seed: 3, photo_scale: 2 };
+pub const TERRAIN: SynthSpec = SynthSpec { posts: 2049, spacing_m: 15.0, seed: 3, photo_scale: 2 };
 /// The light of the demo.
-const SCENE: &str = include_str!("../../../deploy/scenes/demo.toml");
+pub const SCENE: &str = include_str!("../../../deploy/scenes/demo.toml");
 /// The flight of the demo.
-const FLIGHT: &str = include_str!("../../../deploy/scenes/demo.csv");
+pub const FLIGHT: &str = include_str!("../../../deploy/scenes/demo.csv");
 /// Size of the picture, pixels.
 const SIZE: (u32, u32) = (1280, 720);
 /// Frames per second.
-const FPS: f64 = 24.0;
+pub const FPS: f64 = 24.0;
 /// The frame kept as a picture.
 const POSTER: u32 = 20;
 
