@@ -219,9 +219,7 @@ impl Columns<'_, '_> {
         let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
         let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
         let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
-        // Whole vectors are looked at, and twice as much.
-        let width = net::pitch((end_line - first_line) as usize + 2 * MOST);
-        net.clear(first_ray, (end_ray - first_ray) as usize, first_line, width);
+        net.clear(first_ray, (end_ray - first_ray) as usize, first_line..end_line);
         for block in (first_line..end_line).step_by(L::N) {
             let end = block + L::N as i32;
             let meets = |(span, _): &(&Span, u32)| span.lines.start < end && span.lines.end > block;

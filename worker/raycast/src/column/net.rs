@@ -1,6 +1,7 @@
 //! What the rays of a part of a band have found, and what that tells of the pixels between.
 
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
+use std::ops::Range;
 
 /// Rays see the same ground if their depths differ by no more than this share.
 const NEIGHBOURS: f32 = 0.02;
@@ -70,8 +71,9 @@ pub(super) struct Net {
     /// between rays.
     peaks: Vec<f32>,
     peaked: Vec<bool>,
-    /// Answers of a row.
+    /// Answers of a row, and how many of them are of lines that pixels lie between.
     pub width: usize,
+    lines: usize,
     pub first_row: i32,
     pub first_line: i32,
 }
@@ -88,9 +90,12 @@ pub(super) struct Verdict {
 }
 
 impl Net {
-    /// Room for rays that have found nothing; `width` is that of [`pitch`].
-    pub fn clear(&mut self, first_row: i32, rows: usize, first_line: i32, width: usize) {
-        (self.first_row, self.first_line, self.width) = (first_row, first_line, width);
+    /// Room for rays that have found nothing.
+    pub fn clear(&mut self, first_row: i32, rows: usize, lines: Range<i32>) {
+        (self.first_row, self.first_line, self.lines) = (first_row, lines.start, lines.len());
+        // Whole vectors are looked at, and twice as much.
+        self.width = pitch(self.lines + 2 * MOST);
+        let width = self.width;
         // Besides what is lost by the start, a margin for the vectors beyond the end.
         let count = width * rows + LINE + 2 * MOST;
         self.answers.clear();
@@ -131,7 +136,7 @@ impl Net {
     /// Looks for ground behind which there is other ground, once all rays are cast.
     #[inline(always)]
     pub fn find_tips<L: Lanes>(&mut self, rising: bool) {
-        let Net { answers, start, tips, tipped, peaks, peaked, width, .. } = self;
+        let Net { answers, start, tips, tipped, peaks, peaked, width, lines, .. } = self;
         let (width, rows, answers) = (*width, tipped.len(), &answers[*start..]);
         let load = |at: usize| L::F::load(&answers[at..]);
         let (zero, neighbours) = (L::F::splat(0.0), L::F::splat(1.0 - NEIGHBOURS));
@@ -142,7 +147,7 @@ impl Net {
                 continue;
             };
             let (row_at, below, lower) = (row * width, below * width, lower * width);
-            for column in (1..width).step_by(L::N) {
+            for column in (1..*lines).step_by(L::N) {
                 let (here, ground) = (load(row_at + column), load(below + column));
                 let before = (load(lower + column) - ground).abs();
                 let ending =
@@ -192,7 +197,7 @@ impl Net {
         let before = if row > 0 { row - 1 } else { after };
         let answers = &self.answers[self.start..];
         let [before, row, after] = [before, row, after].map(|row| &answers[row * width..]);
-        for column in (1..width).step_by(L::N) {
+        for column in (1..=self.lines).step_by(L::N) {
             let here = L::F::load(&row[column..]);
             let beside = L::F::load(&row[column - 1..]) + L::F::load(&row[column + 1..]);
             (beside - (here + here)).abs().store(&mut bends[column..]);
@@ -204,7 +209,7 @@ impl Net {
         let (flat, uneven) = (L::F::splat(EVEN), L::F::splat(BENT));
         let (broken, behind) = (L::F::splat(BROKEN), L::F::splat(BEHIND));
         let neighbours = L::F::splat(1.0 - NEIGHBOURS);
-        for column in (0..width).step_by(L::N) {
+        for column in (0..self.lines).step_by(L::N) {
             let (a, b) = (L::F::load(&row[column..]), L::F::load(&row[column + 1..]));
             let (low, high) = (a.min(b), a.max(b));
             let bend_a = L::F::load(&bends[column..]);
@@ -246,7 +251,7 @@ impl Net {
                 continue;
             }
             let peaks = &self.peaks[peak * width..];
-            for column in (0..width).step_by(L::N) {
+            for column in (0..=self.lines).step_by(L::N) {
                 let found = L::F::load(&closest[column..]).max(L::F::load(&peaks[column..]));
                 found.store(&mut closest[column..]);
             }
@@ -256,7 +261,7 @@ impl Net {
 
 /// How many answers there are to be in a row for so many lines: whole lines of the cache, an
 /// odd number of them, or rays one behind another would meet in few of its sets.
-pub(super) fn pitch(lines: usize) -> usize {
+fn pitch(lines: usize) -> usize {
     (lines.div_ceil(LINE) | 1) * LINE
 }
 
