@@ -312,6 +312,28 @@ pub(crate) fn prefetch<L: Lanes>(bases: &[*const u8; MOST], at: L::I, mask: L::M
     let _ = (bases, at, mask);
 }
 
+/// Asks for elements of a table, so that they are there when they are read: those that every
+/// fourth place names, and those `stride` behind them. Any place will do.
+#[inline(always)]
+pub(crate) fn prefetch_rows(table: &[u32], places: &[i32], stride: usize) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let mut n = 0;
+        while n < places.len() {
+            let place = table.as_ptr().wrapping_offset(places[n] as isize);
+            // SAFETY: SSE is part of the architecture, and a hint reads nothing.
+            unsafe {
+                _mm_prefetch::<_MM_HINT_T0>(place.cast());
+                _mm_prefetch::<_MM_HINT_T0>(place.wrapping_add(stride).cast());
+            }
+            n += 4;
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (table, places, stride);
+}
+
 /// Floats as the bits that they are.
 pub(crate) fn as_bits(values: &[f32]) -> &[u32] {
     // SAFETY: u32 has the size and alignment of f32, and every bit pattern is a u32.

@@ -250,7 +250,7 @@ impl<'a> Shader<'a> {
             }
             for is_coarser in [false, true] {
                 for n in 0..vectors {
-                    batch.rows.place::<L>(sheets, n, is_coarser);
+                    batch.rows.place::<L>(sheets, n, is_coarser, &mut self.wanted);
                 }
                 let mut sums = Sums {
                     light: &mut batch.light,

@@ -18,7 +18,7 @@ use super::footprint::{Footprint, Strip};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
 use crate::field::Wanted;
-use crate::lanes::{Floats, Ints, Lanes, Mask};
+use crate::lanes::{Floats, Ints, Lanes, MOST, Mask, prefetch_rows};
 use terrafarm_terrain::layout::{TILE_POSTS, TILE_RING};
 use terrafarm_terrain::tile::{FIELDS, PhotoTile, TURNED, Texels};
 
@@ -144,13 +144,15 @@ impl Rows {
         self.lanes[n] = 0;
     }
 
-    /// Finds the rows of vector `n` in the finer level, or in the coarser one.
+    /// Finds the rows of vector `n` in the finer level, or in the coarser one, and asks for
+    /// their first texels. Tiles that are not loaded are added to `missing`.
     #[inline(always)]
     pub(crate) fn place<L: Lanes>(
         &mut self,
-        sheets: &Sheets<PhotoTile>,
+        sheets: &mut Sheets<PhotoTile>,
         n: usize,
         is_coarser: bool,
+        missing: &mut Wanted,
     ) {
         let at = n * L::N;
         let share = self.share::<L>(at, is_coarser);
@@ -202,6 +204,18 @@ impl Rows {
         track.start.store(&mut self.start[at..]);
         track.stop.store(&mut self.stop[at..]);
         track.scale.store(&mut self.scale[at..]);
+        let inside = wanted & !outside;
+        if !inside.any() {
+            return;
+        }
+        // Neighbours mostly share lines of the cache, and most rows of a vector are in one tile.
+        let (level, number) = (first::<L>(level, inside), first::<L>(number, inside));
+        if let Soil::Tile(tile) = sheets.tile(level, number, missing) {
+            let (across, _) = row.across(begin.to_floats());
+            let mut places = [0; MOST];
+            (L::I::load(&self.first[at..]) + across).store(&mut places);
+            prefetch_rows(tile.texels().light, &places[..L::N], TILE_POSTS);
+        }
     }
 
     /// Adds the means of the rows of vector `n` that [`Rows::place`] has found to the sums.
