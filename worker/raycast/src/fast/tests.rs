@@ -9,6 +9,7 @@ use glam::DVec3;
 use std::sync::Arc;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::shading::Earth;
+use terrafarm_terrain::layout::{Layer, Level, TileEntry};
 use terrafarm_terrain::resident::Resident;
 
 const SIZE: (u32, u32) = (80, 60);
@@ -226,11 +227,38 @@ fn insets_and_single_rows_are_refused_by_name_and_left_to_exact_by_auto() {
     let mut view = view(camera, &mut Dice::new(1), quality::Method::Auto);
     for (tolerance_px, look) in [
         (0.01, Look::RayByRay(quality::Method::Exact)),
-        (0.05, Look::Fast(Method::Lod)),
+        (0.05, Look::RayByRay(quality::Method::Exact)),
         (0.5, Look::Fast(Method::Column)),
     ] {
         view.quality.tolerance_px = tolerance_px;
         assert_eq!(Look::of(field, &view), Ok(look));
+    }
+}
+
+#[test]
+fn auto_takes_lod_for_a_small_tolerance_over_terrain_too_large_for_exact() {
+    let vast = |posts| {
+        let mut index = StoreIndex::clone(hills().resident.index());
+        let layer = &mut index.layers[0];
+        layer.posts = [posts; 2];
+        let level = |level: usize| {
+            let tiles = Layer::tiles_for(layer.level_posts(level));
+            Level { tiles, entries: vec![TileEntry::EMPTY; (tiles[0] * tiles[1]) as usize] }
+        };
+        layer.levels = (0..Layer::level_count(layer.posts)).map(level).collect();
+        index.check().unwrap();
+        Resident::new(Arc::new(index))
+    };
+    let camera = Camera::from_angles(DVec3::splat(900.0), 0.0, -40.0, 0.0, 60.0, SIZE);
+    let mut view = view(camera, &mut Dice::new(1), quality::Method::Auto);
+    view.quality.tolerance_px = 0.05;
+    for (posts, look) in
+        [(8192, Look::RayByRay(quality::Method::Exact)), (8193, Look::Fast(Method::Lod))]
+    {
+        let resident = vast(posts);
+        let pyramid = Pyramid::new(resident.index());
+        let field = Field { resident: &resident, pyramid: &pyramid };
+        assert_eq!(Look::of(field, &view), Ok(look), "{posts}");
     }
 }
 
