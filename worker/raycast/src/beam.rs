@@ -145,9 +145,9 @@ impl<'a> Beams<'a> {
         Beams { field, camera, ground, layers, tiles, first_step, slack, only, squares, steps: 0 }
     }
 
-    /// Calls `see` for each pixel of a square with the depth up to which every ray
-    /// through the pixel is free.
-    pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(u32, u32, f64)) {
+    /// Cuts a square of pixels into parts that have no side longer than [`NARROWEST_PX`],
+    /// and calls `see` for each with the depth up to which every ray through it is free.
+    pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(Region, f64)) {
         let front = Front { free: 0.0, step: self.first_step };
         if self.only.is_none() {
             return self.quarter(square, WIDEST_PX, front, see);
@@ -161,12 +161,9 @@ impl<'a> Beams<'a> {
         self.steps += lanes::run(narrow, lanes::widest());
         let (right, bottom) = (square.x + square.width, square.y + square.height);
         for at in 0..self.squares.count {
-            let (left, top) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
-            for row in top..(top + NARROWEST_PX).min(bottom) {
-                for column in left..(left + NARROWEST_PX).min(right) {
-                    see(column, row, self.squares.free[at]);
-                }
-            }
+            let (x, y) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
+            let (width, height) = (NARROWEST_PX.min(right - x), NARROWEST_PX.min(bottom - y));
+            see(Region { x, y, width, height }, self.squares.free[at]);
         }
     }
 
@@ -175,17 +172,12 @@ impl<'a> Beams<'a> {
         square: Region,
         side: u32,
         front: Front,
-        see: &mut impl FnMut(u32, u32, f64),
+        see: &mut impl FnMut(Region, f64),
     ) {
         let front = self.advance(&self.bounds(square), front);
         let Region { x, y, width, height } = square;
         if side <= NARROWEST_PX {
-            for row in y..y + height {
-                for column in x..x + width {
-                    see(column, row, front.free);
-                }
-            }
-            return;
+            return see(square, front.free);
         }
         let half = side / 2;
         let halves = |length: u32| [(0, length.min(half)), (half, length.saturating_sub(half))];
