@@ -159,7 +159,7 @@ impl Abreast<'_, '_> {
                     let number = under_way[n];
                     let approach: &mut Approach<L> = &mut fleet[number];
                     steps += if turn < CELLS_FIRST {
-                        approach.step_cells(&self.sight, self.tiles)
+                        approach.step_cells(self.tiles)
                     } else {
                         approach.step(&self.sight, self.tiles)
                     };
