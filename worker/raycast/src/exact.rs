@@ -22,6 +22,7 @@ mod arc;
 mod many;
 mod rays;
 mod tiles;
+mod window;
 
 pub(crate) use arc::Globe;
 pub(crate) use many::Many;

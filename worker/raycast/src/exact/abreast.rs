@@ -34,6 +34,7 @@
 //! which is not loaded, from their start on.
 
 mod approach;
+mod glide;
 mod walk;
 
 use super::arc::{Globe, Rise};
@@ -147,6 +148,9 @@ impl Abreast<'_, '_> {
             while at < to {
                 fleet.push(self.aim_at::<L, ROUND>(at, lanes_up_to::<L>(to - at)));
                 at += L::N;
+            }
+            for approach in &mut fleet {
+                approach.glide(&self.sight, self.tiles);
             }
             let mut left = fleet.len();
             for (n, number) in under_way[..left].iter_mut().enumerate() {

@@ -1,5 +1,6 @@
 //! The tiles of a layer as kernels read them, by number.
 
+use super::window::Planes;
 use crate::field::{Field, Ground, tile_key};
 use crate::lanes::as_bits;
 use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
@@ -17,15 +18,16 @@ pub(crate) struct Tiles<'a> {
     field: Field<'a>,
     layer: usize,
     /// Tiles along x.
-    columns: i32,
+    pub(super) columns: i32,
     slots: Vec<(i32, Soil<'a>)>,
     /// The tile that was read last.
-    last: (i32, Soil<'a>),
+    pub(super) last: (i32, Soil<'a>),
+    pub(super) planes: Planes,
 }
 
 /// What a tile holds.
 #[derive(Clone, Copy)]
-enum Soil<'a> {
+pub(super) enum Soil<'a> {
     Codes(Codes<'a>),
     /// Heights as they are, as bits.
     Floats {
@@ -126,12 +128,12 @@ impl<'a> Tiles<'a> {
         let levels = &field.index().layers[layer].levels;
         let columns = levels.first().map_or(0, |level| level.tiles[0] as i32);
         let none = (NONE, Soil::Void);
-        Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none }
+        Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none, planes: Planes::new() }
     }
 
     /// Makes `last` the tile with a number.
     #[inline(always)]
-    fn turn_to(&mut self, number: i32) {
+    pub(super) fn turn_to(&mut self, number: i32) {
         let slot = self.slots[number as usize % SLOTS];
         if slot.0 == number { self.last = slot } else { self.fetch(number) }
     }

@@ -49,7 +49,7 @@ use terrafarm_terrain::tile::MAXIMA_LEVELS;
 /// The longest approach, cells along the axis of the larger rate.
 pub(super) const FARTHEST: f64 = 250.0;
 /// Bound of all rounding in positions, cells: more than 6 x 251 x 2^-24.
-const BLUR: f32 = 1.0 / 8192.0;
+pub(super) const BLUR: f32 = 1.0 / 8192.0;
 /// Bound of the twin's own rounding, cells.
 pub(super) const SURE_SLACK: f64 = 1.0 / (1 << 22) as f64;
 /// Share by which heights may differ in f32, that of the ray and those of posts together.
@@ -62,22 +62,22 @@ const STEEPEST: f32 = 1e30;
 pub(super) struct Approach<L: Lanes> {
     pub(super) active: L::M,
     /// The cell in which the ray began.
-    base: [L::I; 2],
+    pub(super) base: [L::I; 2],
     pub(super) cell: [L::I; 2],
     /// The same from `base` on.
-    place: [L::F; 2],
+    pub(super) place: [L::F; 2],
     level: L::I,
     /// How far the ray has come.
-    v: L::F,
+    pub(super) v: L::F,
     /// How far the ray is above the surface there, at least ...
     gap: L::F,
     /// ... but for lanes that come from a block, or from where there is no surface.
-    fresh: L::M,
-    from: [L::F; 2],
-    rate: [L::F; 2],
-    inverse: [L::F; 2],
+    pub(super) fresh: L::M,
+    pub(super) from: [L::F; 2],
+    pub(super) rate: [L::F; 2],
+    pub(super) inverse: [L::F; 2],
     /// 1 along an axis on which the index of the cell grows, else 0 ...
-    ahead: [L::I; 2],
+    pub(super) ahead: [L::I; 2],
     /// ... and the way from `from` to the line ahead of the first cell.
     toward: [L::F; 2],
     /// Within which crossings of the lines of an axis are known, along them ...
@@ -85,12 +85,12 @@ pub(super) struct Approach<L: Lanes> {
     /// ... which counts so much in heights, for each metre of range ...
     blur: L::F,
     /// ... and within which the crossings of both are, as v.
-    tie: L::F,
+    pub(super) tie: L::F,
     /// Minus 1/4 of the product of the rates.
     turn: L::F,
     height: L::F,
-    slope: L::F,
-    reach: L::F,
+    pub(super) slope: L::F,
+    pub(super) reach: L::F,
 }
 
 /// Where lanes leave their blocks.
@@ -181,7 +181,7 @@ impl<L: Lanes> Approach<L> {
 
     /// Bounds of the heights of rays.
     #[inline(always)]
-    fn low(&self, v: L::F) -> L::F {
+    pub(super) fn low(&self, v: L::F) -> L::F {
         self.height + v * self.slope
     }
 
