@@ -1,7 +1,7 @@
 //! Beams: how far all rays through a square of pixels are free, found once for all.
 //!
 //! ```text
-//! square <- 32 x 32 pixels; free <- 0
+//! square <- 64 x 64 pixels; free <- 0
 //! loop
 //!   ground <- the rectangle of the map below the beam from `free` to `free + step`
 //!   if the beam's lowest ray stays above the maximum of the ground
@@ -37,9 +37,9 @@ use terrafarm_terrain::layout::{LayerKind, TILE_CELLS};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
 /// Side of the squares that beams begin with, pixels.
-pub(crate) const WIDEST_PX: u32 = 32;
+pub(crate) const WIDEST_PX: u32 = 64;
 /// Side of the squares whose rays are cast one by one, pixels.
-const NARROWEST_PX: u32 = 4;
+const NARROWEST_PX: u32 = 8;
 /// How far above the ground a beam must stay, metres. The parabolas of a path are within
 /// 1e-4 m of the curve that beams follow, rounding is far less.
 const CLEARANCE_M: f64 = 1e-2;

@@ -123,7 +123,7 @@ fn sweep(
     pyramid: &Pyramid,
     view: &View,
     region: Region,
-    mut see: impl FnMut(&mut Many, usize, Region),
+    mut see: impl FnMut(&mut Many<'_>, usize, Region),
 ) -> Result<Stats, Missing> {
     let mut stats = Stats::default();
     let mut missing = BTreeSet::new();
@@ -132,20 +132,25 @@ fn sweep(
     let method = view.quality.method;
     let mut many = Many::new(field, &view.camera, ground, method, lanes::widest());
     let mut beams = Beams::new(field, &view.camera, ground);
-    let mut parts = Vec::new();
-    for square in squares(region) {
-        parts.clear();
-        many.clear();
-        beams.narrow(square, &mut |part, free| {
-            parts.push((many.len(), part));
-            many.push_centres(part, free);
-        });
+    let mut parts: Vec<(usize, Region)> = Vec::new();
+    let mut flush = |many: &mut Many, parts: &mut Vec<(usize, Region)>| {
         many.cast();
         stats.rays += many.len() as u64;
         stats.hits += many.hits();
-        for &(first, part) in &parts {
-            see(&mut many, first, part);
+        for (first, part) in parts.drain(..) {
+            see(many, first, part);
         }
+        many.clear();
+    };
+    for square in squares(region) {
+        beams.narrow(square, &mut |part, free| {
+            if many.room() < part.area() as usize {
+                flush(&mut many, &mut parts);
+            }
+            parts.push((many.len(), part));
+            many.push_centres(part, free);
+        });
+        flush(&mut many, &mut parts);
     }
     stats.steps = beams.steps + many.steps + many.slow.finish(&mut missing);
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }

@@ -2,6 +2,15 @@
 //!
 //! Does what `Beams::advance` does, over a single height layer. Bounds need not be the
 //! same to the bit: a beam is loose on the safe side by far more.
+//!
+//! A step that is too long is not lost: the beam is free up to where it may have come down
+//! to the highest ground below the step. Each metre lower takes it 1 / fall further at
+//! least, where fall is the least by which its bound sinks for each unit of depth. Over flat
+//! ground that is one number. Over a round Earth of radius R a bound of the height at depth
+//! t is (R + eye) (l + v) / (1 - v - l), with l = t sinc(a) down / R, a the angle over the
+//! map, up to `REACH_RAD`, and v >= 0 of no depth beyond the start of the step. Its slope is
+//! (1 + eye / R) sinc(a) down / (1 - v - l)^2, of which sinc(a) is at least [`SLOWEST`] and
+//! 1 - v - l at most 1 + |t down| / R.
 
 use super::{
     CLEARANCE_M, FLAT_REACH_M, NARROWEST_PX, REACH_RAD, ROUNDING, SHORTEST_STEP, WIDEST_PX,
@@ -18,9 +27,8 @@ const ROOM: usize = MOST_SQUARES + MOST;
 
 /// What is left of a step that was too long.
 const SHORTER: f64 = 0.25;
-/// Over a round Earth: share of the fall that is left of it at least, up to the square of 1 and the
-/// angle that it makes.
-const SLOWEST: f64 = 0.95;
+/// Less than sin(a) / a for an angle of `REACH_RAD`.
+const SLOWEST: f64 = 0.99;
 
 /// The only height layer of a store, as beams of one camera come over it.
 pub(super) struct Layer<'a> {
@@ -192,10 +200,14 @@ impl Layer<'_> {
 
     /// Halves squares until they are the narrowest. Returns the steps taken.
     #[inline(always)]
-    fn narrow<L: Lanes, const ROUND: bool>(&mut self, region: Region, squares: &mut Squares) -> u64 {
+    fn narrow<L: Lanes, const ROUND: bool>(
+        &mut self,
+        region: Region,
+        squares: &mut Squares,
+    ) -> u64 {
         let mut steps = 0;
         let mut side = WIDEST_PX;
-        let mut fleet: Vec<Beam<L>> = Vec::with_capacity(MOST_SQUARES);
+        let mut fleet: Vec<Beam<L>> = Vec::with_capacity(MOST_SQUARES.div_ceil(L::N));
         let mut under_way = [0; MOST_SQUARES];
         while side > NARROWEST_PX {
             side /= 2;
@@ -235,8 +247,11 @@ impl Layer<'_> {
         let count = squares.count - at;
         let lanes = if count < L::N { L::M::from_bits((1 << count) - 1) } else { !L::M::none() };
         let free = L::D::load(&squares.free[at..]);
-        let zero = L::D::splat(0.0);
-        let fall = (zero - bounds.low[2]) * L::D::splat(if self.globe.is_some() { SLOWEST } else { 1.0 });
+        let share = match &self.globe {
+            None => 1.0,
+            Some(globe) => SLOWEST * (1.0 + globe.eye_z.min(0.0) * globe.curvature).max(0.0),
+        };
+        let fall = (L::D::splat(0.0) - bounds.low[2]) * L::D::splat(share);
         Beam {
             active: lanes & free.lt(bounds.reach),
             free,
@@ -272,7 +287,8 @@ impl Layer<'_> {
             back = back * (stretch * stretch);
         }
         let falls = active & !clear & !level_or_up;
-        let come = L::D::select(falls, free.max(end - back), free);
+        let lower = end - back;
+        let come = L::D::select(falls & free.lt(lower), lower, free);
         let come = L::D::select(clear, end, come);
         let long = (beam.width * end + L::D::splat(self.finest_step)).lt(step);
         let shorter = active & !clear & long;

@@ -3,6 +3,7 @@
 //! ```text
 //! for some hundred rays at a time
 //!   direction, stretch, span, where the walk begins
+//!   in f32, down to planes over the ground (`glide`)
 //!   in f32, while it is seen that the ray clears its cell or block: go on (`approach`)
 //!   test the cells in which that has ended: nearly all meet the surface there
 //! walk, for the others, from these cells on
@@ -49,9 +50,9 @@ use walk::Walk;
 
 /// The share of lanes that must be done before they take new rays: one in so many.
 const IDLE_SHARE: usize = 4;
-/// Steps from cell to cell before blocks are tried: beams end close to the ground, and a
-/// step that looks at both costs nearly twice as much.
-const CELLS_FIRST: u32 = 10;
+/// Steps from cell to cell before blocks are tried: approaches begin close to the ground,
+/// and a step that looks at both costs nearly twice as much.
+const CELLS_FIRST: u32 = 16;
 /// Rays that are aimed before the first of them goes on: few enough for the nearest cache.
 const BATCH: usize = 256;
 

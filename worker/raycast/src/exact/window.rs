@@ -73,7 +73,8 @@ impl Tiles<'_> {
         const INSIDE: i32 = TILE_CELLS as i32 - 1;
         const LAST: i32 = (TILE_CELLS as i32 - SIDE) / PITCH * PITCH;
         let [x, y] = [cell[0].max(0), cell[1].max(0)];
-        let first = [(x & !INSIDE) + (x & INSIDE).min(LAST), (y & !INSIDE) + (y & INSIDE).min(LAST)];
+        let first =
+            [(x & !INSIDE) + (x & INSIDE).min(LAST), (y & !INSIDE) + (y & INSIDE).min(LAST)];
         let [column, row] = [first[0] / PITCH % KEPT, first[1] / PITCH % KEPT];
         let slot = (row * KEPT + column) as usize;
         if self.planes.0[slot].first != first {

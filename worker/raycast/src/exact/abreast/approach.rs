@@ -12,29 +12,36 @@
 //! `|rate| <= 1`, `from` in [0, 1] and `v <= FARTHEST`; lines are crossed at
 //! `v = (line - from) inverse`. `from` rounds by at most 2^-24 cells. The difference, `inverse`
 //! and their product, `rate`, its product with v and the sum round once each, by at most
-//! 2^-24 of something that is no larger than `FARTHEST + 1` cells: together less than
-//! [`BLUR`]. The twin's own rounding is below [`SURE_SLACK`], a thousandth of that; else
+//! 2^-24 of something that is no larger than `FARTHEST + 1` cells, and the way to the first
+//! line by 2^-24 of a cell: together less than [`BLUR`]. The twin's own rounding is below [`SURE_SLACK`], a thousandth of that; else
 //! there is no approach.
 //!
 //! **The same cells.** A crossing is off by at most `BLUR` across its line, hence by
 //! `BLUR |inverse|` in v, and its place along the line by `doubt = BLUR (1 + |inverse|)`. A
 //! block is left by the line that is crossed first; where that place is further than
 //! `doubt` from every line across it, the ray crosses between the same two lines, and
-//! enters the same cell. Where it is not, the approach ends.
+//! enters the same cell. A ray that is in a cell goes on to the next along the axis whose
+//! line it crosses first; which one that is, is sure if both crossings are further apart
+//! than `tie`, more than both may be off together. Where it is not, the approach ends. It
+//! also ends by `tie` before the course does: so the line was crossed on the course, and
+//! there is a cell behind it.
 //!
 //! **Nothing is met in a block.** The ray's height is replaced by its tangent at the start,
 //! which is nowhere above it within a span (`path`), but for rounding. So in a block it is at least
 //! the lesser of those at both ends; these are off by up to `doubt` in v, so
-//! `doubt |slope|` is taken off.
+//! `doubt |slope|` is taken off, from the start on.
 //!
 //! **Nor in a cell.** There the height of the tangent above the surface is a parabola,
 //! which hangs below the line through its ends by a quarter of its bend at most. Places
 //! are off by `doubt` along each axis, the ends by as much again, and the surface is no
 //! steeper than the cell's range of heights for each cell: that is six times
-//! `doubt range`; eight are asked for.
+//! `doubt range`; eight are asked for. The gap where a cell is entered is the one where the
+//! last was left, which the surface does not change on their line: it is taken over, less the
+//! eight of the last cell, unless that has no surface.
 //!
 //! **Heights.** Those of posts round four times, the ray's and the surface's and what is
-//! made of them less than twenty times, by 2^-24 of twice the largest height. [`ROUGHNESS`]
+//! made of them less than twenty times, by 2^-24 of twice the largest height or less. That
+//! holds too where they are counted in steps above the lowest of their tile. [`ROUGHNESS`]
 //! is 64 times 2^-24; it is taken off at the start, with the twin's own clearance.
 //!
 //! What overflows becomes infinite or NaN, which clears nothing.

@@ -1,15 +1,16 @@
 //! The beginning of an approach: down to a plane over the ground.
 //!
 //! Beams end above the maxima of blocks, which are flat. Where the ground slopes, a plane
-//! that slopes as it does lies closer, and rays of a small square of pixels begin above the
-//! same few cells. Between posts the surface of a cell is nowhere above a plane that its
-//! four posts do not exceed, so a ray is free as long as it is above the plane and within
-//! the window that the plane is for.
+//! that slopes as it does lies closer, and rays of neighbouring pixels begin above the same
+//! few cells. Between posts the surface of a cell is nowhere above a plane that its four
+//! posts do not exceed, so a ray is free as long as it is above the plane and within the
+//! window that the plane is for.
 //!
-//! A ray comes to a `v` of its own, not to a line. It must be known to be above the plane
-//! there and where it began, with positions off by [`BLUR`], and further than that
-//! from the lines around its cell: so the ray goes through this cell. Windows are left by
-//! less than where a line might be crossed.
+//! Bounds are those of `approach`. The height of a ray's tangent above a plane is linear, so
+//! it is enough to know it at both ends, with positions off by [`BLUR`]. The way ends before
+//! the line could be crossed by which the ray leaves the window. It ends inside a cell, by
+//! more than [`BLUR`] from its lines: so the ray goes through this cell, and the approach
+//! goes on there.
 
 use super::Sight;
 use super::approach::{Approach, BLUR};
@@ -21,7 +22,7 @@ use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 /// through few cells.
 const STEEPEST: f32 = 1.5;
 /// The most windows, one after another.
-const WINDOWS: usize = 2;
+const WINDOWS: usize = 5;
 /// Share of the way to the plane that is gone.
 const NEARLY: f32 = 0.999;
 
