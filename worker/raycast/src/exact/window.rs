@@ -44,7 +44,8 @@ pub(super) const PITCH: i32 = 2;
 /// Planes that are remembered, along either axis.
 const KEPT: i32 = 16;
 
-/// A plane that no ground exceeds in a window of [`SIDE`] x [`SIDE`] cells.
+/// A plane that no ground exceeds in a window of [`SIDE`] x [`SIDE`] cells. NaN if posts are
+/// void from which it is made.
 #[derive(Clone, Copy)]
 pub(super) struct Plane {
     /// The south-west cell of the window.
@@ -143,5 +144,62 @@ impl Tiles<'_> {
         let largest = top.abs() + side * (rise[0].abs() + rise[1].abs());
         let height = base + scale * (top + ROUNDING * largest);
         Some(Plane { first, height, rise: [scale * rise[0], scale * rise[1]] })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Ground, tile_key};
+    use crate::grid::cells_of;
+    use crate::lanes::{self, Kernel, Width};
+    use crate::oracle::{Dice, lands};
+
+    struct Look<'t, 'a>(&'t mut Tiles<'a>, [i32; 2]);
+
+    impl Kernel for Look<'_, '_> {
+        type Output = Option<Plane>;
+
+        #[inline(always)]
+        fn run<L: Lanes>(self) -> Option<Plane> {
+            self.0.plane::<L>(self.1)
+        }
+    }
+
+    #[test]
+    fn no_post_of_a_window_is_above_its_plane() {
+        let (mut posts, mut close) = (0, 0);
+        for (number, land) in lands().iter().enumerate() {
+            let field = Field { resident: &land.resident, pyramid: &land.pyramid };
+            let cells = cells_of(&land.resident.index().layers[0]);
+            let mut dice = Dice::new(9 + number as u64);
+            for width in Width::available() {
+                let mut tiles = Tiles::new(field, 0);
+                for _ in 0..300 {
+                    let cell =
+                        cells.map(|count| dice.below(count.max(1) as u64) as i32 / PITCH * PITCH);
+                    let Some(plane) = lanes::run(Look(&mut tiles, cell), width) else { continue };
+                    let key = tile_key(0, plane.first);
+                    assert_eq!(key, tile_key(0, cell));
+                    let Ground::Loaded(tile) = field.ground(key) else { panic!("it was read") };
+                    for (j, i) in (0..SIDE).flat_map(|j| (0..SIDE).map(move |i| (j, i))) {
+                        let at = [i, j].map(|index| index as usize);
+                        let inside = plane.first.map(|index| index as usize & (TILE_CELLS - 1));
+                        let corners = tile.corners(inside[0] + at[0], inside[1] + at[1]);
+                        for (n, post) in corners.into_iter().enumerate() {
+                            let (i, j) = (i + (n as i32 & 1), j + (n as i32 >> 1));
+                            let rise = f64::from(plane.rise[0]) * f64::from(i)
+                                + f64::from(plane.rise[1]) * f64::from(j);
+                            let room = f64::from(plane.height) + rise - f64::from(post);
+                            let least = -1e-6 * f64::from(post.abs());
+                            assert!(room.is_nan() || room >= least, "{} {room}", land.name);
+                            posts += 1;
+                            close += u32::from(room < 1.0);
+                        }
+                    }
+                }
+            }
+        }
+        assert!(posts > 100_000 && close > 1000, "{posts} posts, {close} close");
     }
 }
