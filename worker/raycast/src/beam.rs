@@ -1,7 +1,7 @@
 //! Beams: how far all rays through a square of pixels are free, found once for all.
 //!
 //! ```text
-//! square <- 32 x 32 pixels; free <- 0
+//! square <- 64 x 64 pixels; free <- 0
 //! loop
 //!   ground <- the rectangle of the map below the beam from `free` to `free + step`
 //!   if the beam's lowest ray stays above the maximum of the ground
@@ -37,9 +37,9 @@ use terrafarm_terrain::layout::{LayerKind, TILE_CELLS};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
 /// Side of the squares that beams begin with, pixels.
-pub(crate) const WIDEST_PX: u32 = 32;
+pub(crate) const WIDEST_PX: u32 = 64;
 /// Side of the squares whose rays are cast one by one, pixels.
-const NARROWEST_PX: u32 = 4;
+const NARROWEST_PX: u32 = 8;
 /// How far above the ground a beam must stay, metres. The parabolas of a path are within
 /// 1e-4 m of the curve that beams follow, rounding is far less.
 const CLEARANCE_M: f64 = 1e-2;
@@ -145,9 +145,9 @@ impl<'a> Beams<'a> {
         Beams { field, camera, ground, layers, tiles, first_step, slack, only, squares, steps: 0 }
     }
 
-    /// Calls `see` for each pixel of a square with the depth up to which every ray
-    /// through the pixel is free.
-    pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(u32, u32, f64)) {
+    /// Cuts a square of pixels into parts that have no side longer than [`NARROWEST_PX`],
+    /// and calls `see` for each with the depth up to which every ray through it is free.
+    pub(crate) fn narrow(&mut self, square: Region, see: &mut impl FnMut(Region, f64)) {
         let front = Front { free: 0.0, step: self.first_step };
         if self.only.is_none() {
             return self.quarter(square, WIDEST_PX, front, see);
@@ -161,12 +161,9 @@ impl<'a> Beams<'a> {
         self.steps += lanes::run(narrow, lanes::widest());
         let (right, bottom) = (square.x + square.width, square.y + square.height);
         for at in 0..self.squares.count {
-            let (left, top) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
-            for row in top..(top + NARROWEST_PX).min(bottom) {
-                for column in left..(left + NARROWEST_PX).min(right) {
-                    see(column, row, self.squares.free[at]);
-                }
-            }
+            let (x, y) = (self.squares.left[at] as u32, self.squares.top[at] as u32);
+            let (width, height) = (NARROWEST_PX.min(right - x), NARROWEST_PX.min(bottom - y));
+            see(Region { x, y, width, height }, self.squares.free[at]);
         }
     }
 
@@ -175,17 +172,12 @@ impl<'a> Beams<'a> {
         square: Region,
         side: u32,
         front: Front,
-        see: &mut impl FnMut(u32, u32, f64),
+        see: &mut impl FnMut(Region, f64),
     ) {
         let front = self.advance(&self.bounds(square), front);
         let Region { x, y, width, height } = square;
         if side <= NARROWEST_PX {
-            for row in y..y + height {
-                for column in x..x + width {
-                    see(column, row, front.free);
-                }
-            }
-            return;
+            return see(square, front.free);
         }
         let half = side / 2;
         let halves = |length: u32| [(0, length.min(half)), (half, length.saturating_sub(half))];

@@ -60,9 +60,12 @@ impl Kernel for Lod<'_, '_> {
         let mut pixels = Vec::new();
         for square in squares(region) {
             pixels.clear();
-            beams.narrow(square, &mut |x, y, free| {
-                let at = (y - region.y) * region.width + (x - region.x);
-                pixels.push(Alone { at, free: (free * (1.0 - ROUNDING)) as f32 });
+            beams.narrow(square, &mut |part, free| {
+                let free = (free * (1.0 - ROUNDING)) as f32;
+                pixels.extend(part.pixels().map(|[x, y]| {
+                    let at = (y - region.y) * region.width + (x - region.x);
+                    Alone { at, free }
+                }));
             });
             seen.rays += pixels.len() as u64;
             seen.steps +=

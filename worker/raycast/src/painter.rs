@@ -108,10 +108,9 @@ impl<'a> Painter<'a> {
     pub(crate) fn region(&mut self, region: Region, progress: &mut Progress) {
         for square in squares(region) {
             let mut todo = Vec::new();
-            self.beams.narrow(square, &mut |x, y, free| {
-                if !progress.has(x, y) {
-                    todo.push(([x, y], free));
-                }
+            self.beams.narrow(square, &mut |part, free| {
+                let left = part.pixels().filter(|&[x, y]| !progress.has(x, y));
+                todo.extend(left.map(|pixel| (pixel, free)));
             });
             for (pixel, free) in todo {
                 if self.many.room() < (self.samples * self.samples) as usize {

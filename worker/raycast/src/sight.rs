@@ -105,20 +105,25 @@ pub fn trace(
     region: Region,
     mut see: impl FnMut(u32, u32, Option<Hit>),
 ) -> Result<Stats, Missing> {
-    sweep(resident, pyramid, view, region, |many, ray, [x, y]| match many.outcome(ray) {
-        Outcome::Hit(contact) => see(x, y, Some(Hit::new(&many.path(ray).0, &contact))),
-        Outcome::Miss => see(x, y, None),
-        Outcome::Unfinished => {}
+    sweep(resident, pyramid, view, region, |many, first, part| {
+        for (ray, [x, y]) in (first..).zip(part.pixels()) {
+            match many.outcome(ray) {
+                Outcome::Hit(contact) => see(x, y, Some(Hit::new(&many.path(ray).0, &contact))),
+                Outcome::Miss => see(x, y, None),
+                Outcome::Unfinished => {}
+            }
+        }
     })
 }
 
-/// Casts the rays through the centres of the pixels of a region and shows each.
+/// Casts the rays through the centres of the pixels of a region, and shows them by small
+/// parts of it: with the number of the first ray of the part, others following row by row.
 fn sweep(
     resident: &Resident,
     pyramid: &Pyramid,
     view: &View,
     region: Region,
-    mut see: impl FnMut(&mut Many, usize, [u32; 2]),
+    mut see: impl FnMut(&mut Many<'_>, usize, Region),
 ) -> Result<Stats, Missing> {
     let mut stats = Stats::default();
     let mut missing = BTreeSet::new();
@@ -127,20 +132,25 @@ fn sweep(
     let method = view.quality.method;
     let mut many = Many::new(field, &view.camera, ground, method, lanes::widest());
     let mut beams = Beams::new(field, &view.camera, ground);
-    let mut pixels = Vec::new();
-    for square in squares(region) {
-        pixels.clear();
-        many.clear();
-        beams.narrow(square, &mut |x, y, free| {
-            pixels.push([x, y]);
-            many.push([f64::from(x) + 0.5, f64::from(y) + 0.5], free);
-        });
+    let mut parts: Vec<(usize, Region)> = Vec::new();
+    let mut flush = |many: &mut Many, parts: &mut Vec<(usize, Region)>| {
         many.cast();
         stats.rays += many.len() as u64;
-        for (ray, &pixel) in pixels.iter().enumerate() {
-            stats.hits += u64::from(many.is_hit(ray) == Some(true));
-            see(&mut many, ray, pixel);
+        stats.hits += many.hits();
+        for (first, part) in parts.drain(..) {
+            see(many, first, part);
         }
+        many.clear();
+    };
+    for square in squares(region) {
+        beams.narrow(square, &mut |part, free| {
+            if many.room() < part.area() as usize {
+                flush(&mut many, &mut parts);
+            }
+            parts.push((many.len(), part));
+            many.push_centres(part, free);
+        });
+        flush(&mut many, &mut parts);
     }
     stats.steps = beams.steps + many.steps + many.slow.finish(&mut missing);
     if missing.is_empty() { Ok(stats) } else { Err(Missing(missing.into_iter().collect())) }
@@ -225,10 +235,13 @@ pub fn depths(
         return Ok(Depths::new(region, seen));
     }
     let mut inverse_depth = vec![0.0; region.area() as usize];
-    let stats = sweep(resident, pyramid, view, region, |many, ray, [x, y]| {
-        let at = (y - region.y) as usize * region.width as usize + (x - region.x) as usize;
-        if let Some(inverse) = many.inverse_depth(ray) {
-            inverse_depth[at] = inverse;
+    let stats = sweep(resident, pyramid, view, region, |many, mut ray, part| {
+        let width = part.width as usize;
+        for y in part.y..part.y + part.height {
+            let row = (y - region.y) as usize * region.width as usize;
+            let at = row + (part.x - region.x) as usize;
+            inverse_depth[at..at + width].copy_from_slice(many.inverse_depths(ray, width));
+            ray += width;
         }
     })?;
     Ok(Depths { region, inverse_depth, stats })

@@ -2,6 +2,15 @@
 //!
 //! Does what `Beams::advance` does, over a single height layer. Bounds need not be the
 //! same to the bit: a beam is loose on the safe side by far more.
+//!
+//! A step that is too long is not lost: the beam is free up to where it may have come down
+//! to the highest ground below the step. Each metre lower takes it 1 / fall further at
+//! least, where fall is the least by which its bound sinks for each unit of depth. Over flat
+//! ground that is one number. Over a round Earth of radius R a bound of the height at depth
+//! t is (R + eye) (l + v) / (1 - v - l), with l = t sinc(a) down / R, a the angle over the
+//! map, up to `REACH_RAD`, and v >= 0 of no depth beyond the start of the step. Its slope is
+//! (1 + eye / R) sinc(a) down / (1 - v - l)^2, of which sinc(a) is at least [`SLOWEST`] and
+//! 1 - v - l at most 1 + |t down| / R.
 
 use super::{
     CLEARANCE_M, FLAT_REACH_M, NARROWEST_PX, REACH_RAD, ROUNDING, SHORTEST_STEP, WIDEST_PX,
@@ -15,6 +24,11 @@ use terrafarm_terrain::tile::MAXIMA_LEVELS;
 /// The most squares at once, and elements of their arrays.
 const MOST_SQUARES: usize = ((WIDEST_PX / NARROWEST_PX) * (WIDEST_PX / NARROWEST_PX)) as usize;
 const ROOM: usize = MOST_SQUARES + MOST;
+
+/// What is left of a step that was too long.
+const SHORTER: f64 = 0.25;
+/// Less than sin(a) / a for an angle of `REACH_RAD`.
+const SLOWEST: f64 = 0.99;
 
 /// The only height layer of a store, as beams of one camera come over it.
 pub(super) struct Layer<'a> {
@@ -54,7 +68,20 @@ pub(super) struct Narrow<'n, 'a> {
     pub(super) squares: &'n mut Squares,
 }
 
+/// Beams on their way.
+struct Beam<L: Lanes> {
+    bounds: Bounds<L>,
+    active: L::M,
+    free: L::D,
+    step: L::D,
+    /// Width of the beams at depth 1.
+    width: L::D,
+    /// How much further a beam comes for each metre that it may be lower, at least.
+    inverse_fall: L::D,
+}
+
 /// Bounds of the directions in squares; see `Bounds` of the slow twin.
+#[derive(Clone, Copy)]
 struct Bounds<L: Lanes> {
     low: [L::D; 3],
     high: [L::D; 3],
@@ -112,26 +139,10 @@ impl Kernel for Narrow<'_, '_> {
     #[inline(always)]
     fn run<L: Lanes>(self) -> u64 {
         let Narrow { layer, region, squares } = self;
-        let mut steps = 0;
-        let mut side = WIDEST_PX;
-        while side > NARROWEST_PX {
-            side /= 2;
-            squares.quarter(f64::from(side), region);
-            let mut at = 0;
-            while at < squares.count {
-                let left = squares.count - at;
-                let lanes =
-                    if left < L::N { L::M::from_bits((1 << left) - 1) } else { !L::M::none() };
-                steps += match layer.globe {
-                    None => layer.advance::<L, false>(squares, region, at, f64::from(side), lanes),
-                    Some(_) => {
-                        layer.advance::<L, true>(squares, region, at, f64::from(side), lanes)
-                    }
-                };
-                at += L::N;
-            }
+        match layer.globe {
+            None => layer.narrow::<L, false>(region, squares),
+            Some(_) => layer.narrow::<L, true>(region, squares),
         }
-        steps
     }
 }
 
@@ -187,61 +198,116 @@ impl Layer<'_> {
         Bounds { low, high, across_squared: x * x + y * y, reach, longest }
     }
 
-    /// Goes on with N beams as far as they are free.
+    /// Halves squares until they are the narrowest. Returns the steps taken.
     #[inline(always)]
-    fn advance<L: Lanes, const ROUND: bool>(
+    fn narrow<L: Lanes, const ROUND: bool>(
         &mut self,
-        squares: &mut Squares,
         region: Region,
-        at: usize,
-        side: f64,
-        lanes: L::M,
+        squares: &mut Squares,
     ) -> u64 {
-        let bounds = self.bounds::<L>(squares, region, at, side);
-        let (half, two) = (L::D::splat(0.5), L::D::splat(2.0));
-        let eye_z = L::D::splat(self.camera.position.z);
-        let width = L::D::splat(side / self.camera.focal_px() * SHORTEST_STEP);
-        let level_or_up = L::D::splat(0.0).le(bounds.low[2]);
-        let mut free = L::D::load(&squares.free[at..]);
-        let mut step = L::D::load(&squares.step[at..]);
-        let mut active = lanes & free.lt(bounds.reach);
         let mut steps = 0;
-        while active.any() {
-            steps += u64::from(active.count());
-            let end = (free + step).min(bounds.reach);
-            let mut rise = (bounds.low[2] * free).min(bounds.low[2] * end);
-            if let (true, Some(globe)) = (ROUND, &self.globe) {
-                rise = globe.rise::<L>(bounds.across_squared * free * free, rise);
+        let mut side = WIDEST_PX;
+        let mut fleet: Vec<Beam<L>> = Vec::with_capacity(MOST_SQUARES.div_ceil(L::N));
+        let mut under_way = [0; MOST_SQUARES];
+        while side > NARROWEST_PX {
+            side /= 2;
+            squares.quarter(f64::from(side), region);
+            fleet.clear();
+            let mut at = 0;
+            while at < squares.count {
+                under_way[fleet.len()] = fleet.len();
+                fleet.push(self.beams::<L>(squares, region, at, f64::from(side)));
+                at += L::N;
             }
-            let room = L::D::splat(self.slack) * end * bounds.longest;
-            let lowest = eye_z + rise - L::D::splat(CLEARANCE_M) - room;
-            let away = active & level_or_up & L::D::splat(self.highest).lt(lowest);
-            free = L::D::select(away, L::D::splat(f64::INFINITY), free);
-            active = active & !away;
-            let clear = active & self.is_clear::<L>(&bounds, free, end, lowest, active);
-            free = L::D::select(clear, end, free);
-            let long = (width * end + L::D::splat(self.finest_step)).lt(step);
-            let shorter = active & !clear & long;
-            step = L::D::select(clear, two * step, step);
-            step = L::D::select(shorter, half * step, step);
-            active = ((active & clear) | shorter) & free.lt(bounds.reach);
+            let mut left = fleet.len();
+            while left > 0 {
+                let mut kept = 0;
+                for n in 0..left {
+                    let number = under_way[n];
+                    let beam = &mut fleet[number];
+                    steps += u64::from(beam.active.count());
+                    self.step::<L, ROUND>(beam);
+                    under_way[kept] = number;
+                    kept += usize::from(beam.active.any());
+                }
+                left = kept;
+            }
+            for (number, beam) in fleet.iter().enumerate() {
+                beam.free.store(&mut squares.free[number * L::N..]);
+                beam.step.store(&mut squares.step[number * L::N..]);
+            }
         }
-        free.store(&mut squares.free[at..]);
-        step.store(&mut squares.step[at..]);
         steps
     }
 
-    /// Whether all ground below beams from one depth to another is lower than `lowest`,
-    /// by four blocks that cover it.
+    /// The beams of the squares from one on, as far as they are free.
     #[inline(always)]
-    fn is_clear<L: Lanes>(
+    fn beams<L: Lanes>(&self, squares: &Squares, region: Region, at: usize, side: f64) -> Beam<L> {
+        let bounds = self.bounds::<L>(squares, region, at, side);
+        let count = squares.count - at;
+        let lanes = if count < L::N { L::M::from_bits((1 << count) - 1) } else { !L::M::none() };
+        let free = L::D::load(&squares.free[at..]);
+        let share = match &self.globe {
+            None => 1.0,
+            Some(globe) => SLOWEST * (1.0 + globe.eye_z.min(0.0) * globe.curvature).max(0.0),
+        };
+        let fall = (L::D::splat(0.0) - bounds.low[2]) * L::D::splat(share);
+        Beam {
+            active: lanes & free.lt(bounds.reach),
+            free,
+            step: L::D::load(&squares.step[at..]),
+            width: L::D::splat(side / self.camera.focal_px() * SHORTEST_STEP),
+            inverse_fall: L::D::splat(1.0).div(fall + L::D::splat(self.slack) * bounds.longest),
+            bounds,
+        }
+    }
+
+    /// Takes N beams a step further.
+    #[inline(always)]
+    fn step<L: Lanes, const ROUND: bool>(&mut self, beam: &mut Beam<L>) {
+        let Beam { bounds, free, step, active, .. } = *beam;
+        let zero = L::D::splat(0.0);
+        let end = (free + step).min(bounds.reach);
+        let level_or_up = zero.le(bounds.low[2]);
+        let mut rise = (bounds.low[2] * free).min(bounds.low[2] * end);
+        if let (true, Some(globe)) = (ROUND, &self.globe) {
+            rise = globe.rise::<L>(bounds.across_squared * free * free, rise);
+        }
+        let room = L::D::splat(self.slack) * end * bounds.longest;
+        let eye_z = L::D::splat(self.camera.position.z);
+        let lowest = eye_z + rise - L::D::splat(CLEARANCE_M) - room;
+        let away = active & level_or_up & L::D::splat(self.highest).lt(lowest);
+        let active = active & !away;
+        let highest = self.highest_below::<L>(&bounds, free, end, active);
+        let clear = active & highest.lt(lowest);
+        // Where the beam comes down to the highest ground below it.
+        let mut back = (highest - lowest) * beam.inverse_fall;
+        if let (true, Some(globe)) = (ROUND, &self.globe) {
+            let stretch = L::D::splat(1.0) - bounds.low[2] * end * L::D::splat(globe.curvature);
+            back = back * (stretch * stretch);
+        }
+        let falls = active & !clear & !level_or_up;
+        let lower = end - back;
+        let come = L::D::select(falls & free.lt(lower), lower, free);
+        let come = L::D::select(clear, end, come);
+        let long = (beam.width * end + L::D::splat(self.finest_step)).lt(step);
+        let shorter = active & !clear & long;
+        let next = L::D::select(clear, step + step, step);
+        beam.step = L::D::select(shorter, L::D::splat(SHORTER) * step, next);
+        beam.free = L::D::select(away, L::D::splat(f64::INFINITY), come);
+        beam.active = (clear | shorter) & come.lt(bounds.reach);
+    }
+
+    /// Height that no ground below beams from one depth to another exceeds, by four blocks
+    /// that cover it; infinite where these are larger than tiles.
+    #[inline(always)]
+    fn highest_below<L: Lanes>(
         &mut self,
         bounds: &Bounds<L>,
         start: L::D,
         end: L::D,
-        lowest: L::D,
         lanes: L::M,
-    ) -> L::M {
+    ) -> L::D {
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
         let mut outside = L::M::none();
         let (mut first, mut last) = ([zero; 2], [zero; 2]);
@@ -267,15 +333,15 @@ impl Layer<'_> {
             let longer = L::I::splat(1 << bits).lt(side);
             level = L::I::select(longer, level + one, level);
         }
-        let mut clear = inside & !L::I::splat(1 << MAXIMA_LEVELS).lt(side);
+        let far = L::I::splat(1 << MAXIMA_LEVELS).lt(side);
+        let none = L::D::splat(f64::NEG_INFINITY);
+        let mut highest = L::D::select(far & inside, L::D::splat(f64::INFINITY), none);
+        let near = inside & !far;
         for corner in
             [[first[0], first[1]], [last[0], last[1]], [last[0], first[1]], [first[0], last[1]]]
         {
-            if clear.any() {
-                let (highest, _) = self.tiles.maxima::<L>(corner, level, clear);
-                clear = clear & highest.lt(lowest);
-            }
+            highest = highest.max(self.tiles.maxima::<L>(corner, level, near).0);
         }
-        (lanes & outside) | clear
+        highest
     }
 }

@@ -77,16 +77,18 @@ fn beams_change_no_bit_of_any_hit() {
             };
             for square in squares(Region::whole(SIZE.0, SIZE.1)) {
                 assert!(square.width <= WIDEST_PX && square.height <= WIDEST_PX);
-                beams.narrow(square, &mut |x, y, free| {
-                    // The corners of a pixel are the farthest from the middle of the beam.
-                    for (dx, dy) in [(0.5, 0.5), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
-                        let place = [f64::from(x) + dx, f64::from(y) + dy];
-                        let (path, free_u) = path(&view.camera, ground, place, free);
-                        let found = answer(exact.cast(&path, free_u));
-                        let alone = answer(exact.cast(&path, 0.0));
-                        assert_eq!(bits(found), bits(alone), "{} {x} {y} {view:?}", land.name);
-                        ahead += u64::from(free_u > 0.0);
-                        hits += u64::from(found.is_some());
+                beams.narrow(square, &mut |part, free| {
+                    for [x, y] in part.pixels() {
+                        // The corners of a pixel are the farthest from the middle of the beam.
+                        for (dx, dy) in [(0.5, 0.5), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
+                            let place = [f64::from(x) + dx, f64::from(y) + dy];
+                            let (path, free_u) = path(&view.camera, ground, place, free);
+                            let found = answer(exact.cast(&path, free_u));
+                            let alone = answer(exact.cast(&path, 0.0));
+                            assert_eq!(bits(found), bits(alone), "{} {x} {y} {view:?}", land.name);
+                            ahead += u64::from(free_u > 0.0);
+                            hits += u64::from(found.is_some());
+                        }
                     }
                 });
             }

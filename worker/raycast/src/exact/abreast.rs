@@ -3,6 +3,7 @@
 //! ```text
 //! for some hundred rays at a time
 //!   direction, stretch, span, where the walk begins
+//!   in f32, down to planes over the ground (`glide`)
 //!   in f32, while it is seen that the ray clears its cell or block: go on (`approach`)
 //!   test the cells in which that has ended: nearly all meet the surface there
 //! walk, for the others, from these cells on
@@ -34,12 +35,13 @@
 //! which is not loaded, from their start on.
 
 mod approach;
+mod glide;
 mod walk;
 
 use super::arc::{Globe, Rise};
 use super::rays::{Part, Rays, Verdict};
 use super::tiles::Tiles;
-use crate::lanes::{Doubles, Ints, Kernel, Lanes, MOST, Mask};
+use crate::lanes::{Doubles, Floats, Ints, Kernel, Lanes, MOST, Mask};
 use crate::painter::ROUNDING;
 use crate::path::{FLAT_REACH_M, REACH_RAD};
 use approach::Approach;
@@ -48,9 +50,9 @@ use walk::Walk;
 
 /// The share of lanes that must be done before they take new rays: one in so many.
 const IDLE_SHARE: usize = 4;
-/// Steps from cell to cell before blocks are tried: beams end close to the ground, and a
-/// step that looks at both costs nearly twice as much.
-const CELLS_FIRST: u32 = 10;
+/// Steps from cell to cell before blocks are tried: approaches begin close to the ground,
+/// and a step that looks at both costs nearly twice as much.
+const CELLS_FIRST: u32 = 16;
 /// Rays that are aimed before the first of them goes on: few enough for the nearest cache.
 const BATCH: usize = 256;
 
@@ -90,7 +92,17 @@ fn lanes_up_to<L: Lanes>(count: usize) -> L::M {
     if count < L::N { L::M::from_bits((1 << count) - 1) } else { !L::M::none() }
 }
 
-/// Casts all rays of a list. Returns the blocks and cells looked at.
+/// What became of a list of rays.
+pub(super) struct Tally {
+    /// Blocks and cells looked at.
+    pub steps: u64,
+    /// Rays that met the surface.
+    pub hits: u64,
+    /// Whether rays are left to the slow twin.
+    pub any_open: bool,
+}
+
+/// Casts all rays of a list.
 pub(super) struct Abreast<'r, 'a> {
     pub sight: Sight<'a>,
     pub tiles: &'r mut Tiles<'a>,
@@ -100,10 +112,10 @@ pub(super) struct Abreast<'r, 'a> {
 }
 
 impl Kernel for Abreast<'_, '_> {
-    type Output = u64;
+    type Output = Tally;
 
     #[inline(always)]
-    fn run<L: Lanes>(mut self) -> u64 {
+    fn run<L: Lanes>(mut self) -> Tally {
         let steps = match self.sight.globe {
             None => {
                 let steps = self.begin::<L, false>();
@@ -114,8 +126,8 @@ impl Kernel for Abreast<'_, '_> {
                 steps + self.walk::<L, true>()
             }
         };
-        self.measure::<L>();
-        steps
+        let (hits, any_open) = self.measure::<L>();
+        Tally { steps, hits, any_open }
     }
 }
 
@@ -138,6 +150,9 @@ impl Abreast<'_, '_> {
                 fleet.push(self.aim_at::<L, ROUND>(at, lanes_up_to::<L>(to - at)));
                 at += L::N;
             }
+            for approach in &mut fleet {
+                approach.glide(&self.sight, self.tiles);
+            }
             let mut left = fleet.len();
             for (n, number) in under_way[..left].iter_mut().enumerate() {
                 *number = n;
@@ -149,7 +164,7 @@ impl Abreast<'_, '_> {
                     let number = under_way[n];
                     let approach: &mut Approach<L> = &mut fleet[number];
                     steps += if turn < CELLS_FIRST {
-                        approach.step_cells(&self.sight, self.tiles)
+                        approach.step_cells(self.tiles)
                     } else {
                         approach.step(&self.sight, self.tiles)
                     };
@@ -265,11 +280,9 @@ impl Abreast<'_, '_> {
         self.store::<L>(Part::InverseY, at, inverse[1]);
         self.store::<L>(Part::First, at, first);
         self.store::<L>(Part::Last, at, last);
-        let open = open.bits();
-        for lane in 0..L::N {
-            let open = open >> lane & 1 == 1;
-            self.rays.verdicts[at + lane] = if open { Verdict::Open } else { Verdict::Miss };
-        }
+        let (open_code, miss) =
+            (L::I::splat(Verdict::Open as i32), L::I::splat(Verdict::Miss as i32));
+        L::I::select(open, open_code, miss).store(&mut self.rays.verdicts[at..]);
         let start = Start { begin, last, rate, inverse, z, fall };
         let mut approach = Approach::new(&sight, &start);
         approach.active = approach.active & lanes;
@@ -296,12 +309,9 @@ impl Abreast<'_, '_> {
         self.store::<L>(Part::Z, at, hit_z);
         cell[0].store(&mut self.rays.cells[0][at..]);
         cell[1].store(&mut self.rays.cells[1][at..]);
-        let hit = hits.bits();
-        for lane in 0..L::N {
-            let verdict = self.rays.verdicts[at + lane];
-            let verdict = if hit >> lane & 1 == 1 { Verdict::Hit } else { verdict };
-            self.rays.verdicts[at + lane] = verdict;
-        }
+        let before = L::I::load(&self.rays.verdicts[at..]);
+        let verdicts = L::I::select(hits, L::I::splat(Verdict::Hit as i32), before);
+        verdicts.store(&mut self.rays.verdicts[at..]);
         if left.any() {
             self.leave::<L, ROUND>(at, walk, left, near);
         }
@@ -345,9 +355,11 @@ impl Abreast<'_, '_> {
         value.store(&mut self.rays.part_mut(part)[at..]);
     }
 
-    /// One over the depths of all contacts.
+    /// One over the depths of all contacts. Returns how many there are, and whether rays
+    /// are left to the slow twin.
     #[inline(always)]
-    fn measure<L: Lanes>(&mut self) {
+    fn measure<L: Lanes>(&mut self) -> (u64, bool) {
+        let (mut count, mut open) = (0, L::M::none());
         let [x, y, z] = self.sight.camera.forward.to_array();
         let mut at = 0;
         while at < self.rays.count {
@@ -355,9 +367,17 @@ impl Abreast<'_, '_> {
                 + self.load::<L>(Part::DirectionY, at) * L::D::splat(y)
                 + self.load::<L>(Part::DirectionZ, at) * L::D::splat(z);
             let depth = self.load::<L>(Part::U, at) * along_axis;
-            self.store::<L>(Part::InverseDepth, at, L::D::splat(1.0).div(depth));
+            let verdicts = L::I::load(&self.rays.verdicts[at..]);
+            let lanes = lanes_up_to::<L>(self.rays.count - at);
+            let hits = lanes & verdicts.eq(L::I::splat(Verdict::Hit as i32));
+            let inverse = L::D::splat(1.0).div(depth).to_floats();
+            let seen = L::F::select(hits, inverse, L::F::splat(0.0));
+            seen.store(&mut self.rays.inverse_depths[at..]);
+            count += u64::from(hits.count());
+            open = open | (lanes & verdicts.eq(L::I::splat(Verdict::Open as i32)));
             at += L::N;
         }
+        (count, open.any())
     }
 
     /// Casts all rays, by two sets of lanes in turn: each takes a step while the other
@@ -437,7 +457,7 @@ impl Abreast<'_, '_> {
             self.rays.part_mut(Part::Z)[ray] = zs[lane];
             self.rays.cells[0][ray] = xs[lane];
             self.rays.cells[1][ray] = ys[lane];
-            self.rays.verdicts[ray] = Verdict::Hit;
+            self.rays.verdicts[ray] = Verdict::Hit as i32;
             bits &= bits - 1;
         }
     }
@@ -450,7 +470,7 @@ impl Abreast<'_, '_> {
         for (lane, &ray) in numbers.iter().enumerate().take(L::N) {
             if lanes.bits() >> lane & 1 == 1 {
                 let ray = self.rest.origins[ray as usize] as usize;
-                self.rays.verdicts[ray] = Verdict::Open;
+                self.rays.verdicts[ray] = Verdict::Open as i32;
             }
         }
     }

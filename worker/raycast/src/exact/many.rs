@@ -12,6 +12,7 @@ use crate::path::{self, Path};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::quality::Method;
+use terrafarm_common::region::Region;
 use terrafarm_terrain::layout::LayerKind;
 
 pub(crate) use super::rays::MOST_RAYS;
@@ -30,6 +31,7 @@ pub(crate) struct Many<'a> {
     rest: Rays,
     /// What the slow caster found, by ray.
     outcomes: Vec<Outcome>,
+    hits: u64,
     /// Blocks and cells looked at abreast.
     pub steps: u64,
 }
@@ -60,6 +62,7 @@ impl<'a> Many<'a> {
             rays: Rays::new(),
             rest: Rays::new(),
             outcomes: vec![Outcome::Miss; MOST_RAYS],
+            hits: 0,
             steps: 0,
         }
     }
@@ -90,25 +93,64 @@ impl<'a> Many<'a> {
         self.rays.count = at + 1;
     }
 
+    /// Adds the rays through the centres of pixels, row by row. There must be room.
+    #[inline]
+    pub(crate) fn push_centres(&mut self, pixels: Region, depth: f64) {
+        /// Rays that are written at once: what is too much is written over, or is behind
+        /// the last ray.
+        const ABREAST: u32 = 4;
+        let rays = &mut self.rays;
+        for row in 0..pixels.height {
+            let y = f64::from(pixels.y + row) + 0.5;
+            let mut column = 0;
+            while column < pixels.width {
+                let at = rays.count;
+                let x = f64::from(pixels.x + column) + 0.5;
+                let end = at + ABREAST as usize;
+                let places = &mut rays.part_mut(Part::PlaceX)[at..end];
+                (0..ABREAST).zip(places).for_each(|(n, place)| *place = x + f64::from(n));
+                rays.part_mut(Part::PlaceY)[at..end].fill(y);
+                rays.part_mut(Part::Depth)[at..end].fill(depth);
+                let taken = ABREAST.min(pixels.width - column);
+                rays.count = at + taken as usize;
+                column += taken;
+            }
+        }
+    }
+
     /// Casts all rays of the list.
     pub(crate) fn cast(&mut self) {
         let count = self.rays.count;
-        match &mut self.abreast {
+        let any_open = match &mut self.abreast {
             Some(Layer { sight, tiles, .. }) => {
                 let (rays, rest) = (&mut self.rays, &mut self.rest);
                 let abreast = Abreast { sight: *sight, tiles, rays, rest };
-                self.steps += lanes::run(abreast, self.width);
+                let tally = lanes::run(abreast, self.width);
+                self.steps += tally.steps;
+                self.hits = tally.hits;
+                tally.any_open
             }
-            None => self.rays.verdicts[..count].fill(Verdict::Open),
+            None => {
+                self.rays.verdicts[..count].fill(Verdict::Open as i32);
+                self.hits = 0;
+                true
+            }
+        };
+        if any_open {
+            self.cast_open();
         }
-        for ray in 0..count {
-            if self.rays.verdicts[ray] == Verdict::Open {
+    }
+
+    /// Casts those that could not be cast abreast.
+    #[cold]
+    fn cast_open(&mut self) {
+        for ray in 0..self.rays.count {
+            if self.rays.verdict(ray) == Verdict::Open {
                 self.cast_slowly(ray);
             }
         }
     }
 
-    #[cold]
     fn cast_slowly(&mut self, ray: usize) {
         let (path, free_u) = self.path(ray);
         let outcome = self.slow.cast(&path, free_u);
@@ -116,11 +158,16 @@ impl<'a> Many<'a> {
         for (axis, part) in directions.into_iter().enumerate() {
             self.rays.part_mut(part)[ray] = path.direction[axis];
         }
-        if let Outcome::Hit(contact) = &outcome {
-            self.rays.part_mut(Part::U)[ray] = contact.u;
-            let along_axis = path.direction.dot(self.camera.forward);
-            self.rays.part_mut(Part::InverseDepth)[ray] = 1.0 / (contact.u * along_axis);
-        }
+        self.rays.inverse_depths[ray] = match &outcome {
+            Outcome::Hit(contact) => {
+                self.hits += 1;
+                self.rays.part_mut(Part::U)[ray] = contact.u;
+                let along_axis = path.direction.dot(self.camera.forward);
+                (1.0 / (contact.u * along_axis)) as f32
+            }
+            Outcome::Miss => 0.0,
+            Outcome::Unfinished => f32::NAN,
+        };
         self.outcomes[ray] = outcome;
     }
 
@@ -143,16 +190,22 @@ impl<'a> Many<'a> {
         self.rays.part(Part::U)[ray]
     }
 
-    /// One over the depth of what a ray met, per metre; see [`crate::Depths`].
+    /// Rays of the list that met the surface.
+    pub(crate) fn hits(&self) -> u64 {
+        self.hits
+    }
+
+    /// One over the depths of what some rays met, per metre; see [`crate::Depths`]. 0 for
+    /// nothing, NaN if it cannot be told for want of a tile.
     #[inline]
-    pub(crate) fn inverse_depth(&self, ray: usize) -> Option<f32> {
-        self.is_hit(ray)?.then(|| self.rays.part(Part::InverseDepth)[ray] as f32)
+    pub(crate) fn inverse_depths(&self, first: usize, count: usize) -> &[f32] {
+        &self.rays.inverse_depths[first..first + count]
     }
 
     /// Whether a ray met the surface; `None` if it cannot be told for want of a tile.
     #[inline]
     pub(crate) fn is_hit(&self, ray: usize) -> Option<bool> {
-        match self.rays.verdicts[ray] {
+        match self.rays.verdict(ray) {
             Verdict::Hit => Some(true),
             Verdict::Miss => Some(false),
             Verdict::Open => match self.outcomes[ray] {
@@ -165,7 +218,7 @@ impl<'a> Many<'a> {
 
     /// What became of a ray.
     pub(crate) fn outcome(&mut self, ray: usize) -> Outcome {
-        match self.rays.verdicts[ray] {
+        match self.rays.verdict(ray) {
             Verdict::Hit => self.contact(ray).map_or(Outcome::Miss, Outcome::Hit),
             Verdict::Miss => Outcome::Miss,
             Verdict::Open => self.outcomes[ray],

@@ -44,26 +44,31 @@ pub(super) enum Part {
     /// The cell in which the walk begins.
     CellX,
     CellY,
-    /// One over the depth of the contact, per metre.
-    InverseDepth,
 }
 
-const PARTS: usize = Part::InverseDepth as usize + 1;
+const PARTS: usize = Part::CellY as usize + 1;
 
 /// What became of a ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(i32)]
 pub(super) enum Verdict {
-    Hit,
     Miss,
+    Hit,
     /// It is for the slow twin to say.
     Open,
 }
+
+const HIT: i32 = Verdict::Hit as i32;
+const MISS: i32 = Verdict::Miss as i32;
 
 /// Rays of one view over one layer.
 pub(super) struct Rays {
     parts: Vec<[f64; ROOM]>,
     pub(super) cells: [Vec<i32>; 2],
-    pub(super) verdicts: Vec<Verdict>,
+    /// Verdicts, as numbers that lanes can hold.
+    pub(super) verdicts: Vec<i32>,
+    /// One over the depths of contacts, per metre; 0 where there is none.
+    pub(super) inverse_depths: Vec<f32>,
     /// Of rays that were taken from another list: their numbers there.
     pub(super) origins: Vec<u32>,
     pub(super) count: usize,
@@ -75,7 +80,8 @@ impl Rays {
             parts: vec![[0.0; ROOM]; PARTS],
             cells: [vec![0; ROOM], vec![0; ROOM]],
             origins: vec![0; ROOM],
-            verdicts: vec![Verdict::Miss; ROOM],
+            verdicts: vec![Verdict::Miss as i32; ROOM],
+            inverse_depths: vec![0.0; ROOM],
             count: 0,
         }
     }
@@ -88,6 +94,15 @@ impl Rays {
         }
         self.origins[at] = ray as u32;
         self.count = at + 1;
+    }
+
+    #[inline(always)]
+    pub(super) fn verdict(&self, ray: usize) -> Verdict {
+        match self.verdicts[ray] {
+            HIT => Verdict::Hit,
+            MISS => Verdict::Miss,
+            _ => Verdict::Open,
+        }
     }
 
     #[inline(always)]

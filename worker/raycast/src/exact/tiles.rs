@@ -1,5 +1,6 @@
 //! The tiles of a layer as kernels read them, by number.
 
+use super::window::Planes;
 use crate::field::{Field, Ground, tile_key};
 use crate::lanes::as_bits;
 use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
@@ -17,15 +18,16 @@ pub(crate) struct Tiles<'a> {
     field: Field<'a>,
     layer: usize,
     /// Tiles along x.
-    columns: i32,
+    pub(super) columns: i32,
     slots: Vec<(i32, Soil<'a>)>,
     /// The tile that was read last.
-    last: (i32, Soil<'a>),
+    pub(super) last: (i32, Soil<'a>),
+    pub(super) planes: Planes,
 }
 
 /// What a tile holds.
 #[derive(Clone, Copy)]
-enum Soil<'a> {
+pub(super) enum Soil<'a> {
     Codes(Codes<'a>),
     /// Heights as they are, as bits.
     Floats {
@@ -54,8 +56,10 @@ pub(super) struct Corners<L: Lanes> {
 pub(super) struct Rough<L: Lanes> {
     /// Of blocks: -infinity where no cell has a surface.
     pub highest: L::F,
-    /// The corners of cells, in the order of [`Corners`].
+    /// The corners of cells, in the order of [`Corners`]: metres above `base`, by `scale`.
     pub heights: [L::F; 4],
+    pub scale: L::F,
+    pub base: L::F,
     /// The cells that have a surface.
     pub solid: L::M,
     /// The lanes whose tile is not loaded.
@@ -68,19 +72,35 @@ impl<L: Lanes> Rough<L> {
         Rough {
             highest: L::F::splat(f32::NEG_INFINITY),
             heights: [L::F::splat(0.0); 4],
+            scale: L::F::splat(1.0),
+            base: L::F::splat(0.0),
             solid: L::M::none(),
             absent: L::M::none(),
         }
     }
 
+    /// Cells of one tile.
+    #[inline(always)]
+    fn of_codes(codes: &Codes, at: L::I, lanes: L::M) -> Self {
+        let (read, solid) = read_pairs::<L>(codes, at, lanes);
+        Rough {
+            heights: [
+                read[0].to_floats(),
+                read[1].to_floats(),
+                read[2].to_floats(),
+                read[3].to_floats(),
+            ],
+            scale: L::F::splat(codes.step as f32),
+            base: L::F::splat((f64::from(codes.base) * codes.step) as f32),
+            solid,
+            ..Rough::none()
+        }
+    }
+
     #[inline(always)]
     fn read_codes(&mut self, codes: &Codes, at: L::I, lanes: L::M) {
-        let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
-        let south = L::I::gather_pairs(codes.posts, at, lanes);
-        let north = L::I::gather_pairs(codes.posts, at + L::I::splat(TILE_POSTS as i32), lanes);
-        let read = [south & low, south.shr(sixteen) & low, north & low, north.shr(sixteen) & low];
-        let highest = read[0].max(read[1]).max(read[2].max(read[3]));
-        self.solid = self.solid | (lanes & highest.lt(L::I::splat(i32::from(VOID))));
+        let (read, solid) = read_pairs::<L>(codes, at, lanes);
+        self.solid = self.solid | solid;
         for n in 0..4 {
             let height = rough_heights::<L>(codes, read[n]);
             self.heights[n] = L::F::select(lanes, height, self.heights[n]);
@@ -108,12 +128,12 @@ impl<'a> Tiles<'a> {
         let levels = &field.index().layers[layer].levels;
         let columns = levels.first().map_or(0, |level| level.tiles[0] as i32);
         let none = (NONE, Soil::Void);
-        Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none }
+        Tiles { field, layer, columns, slots: vec![none; SLOTS], last: none, planes: Planes::new() }
     }
 
     /// Makes `last` the tile with a number.
     #[inline(always)]
-    fn turn_to(&mut self, number: i32) {
+    pub(super) fn turn_to(&mut self, number: i32) {
         let slot = self.slots[number as usize % SLOTS];
         if slot.0 == number { self.last = slot } else { self.fetch(number) }
     }
@@ -203,6 +223,10 @@ impl<'a> Tiles<'a> {
     pub(super) fn rough_corners<L: Lanes>(&mut self, cell: [L::I; 2], lanes: L::M) -> Rough<L> {
         let at = post::<L>(cell);
         let numbers = self.numbers::<L>(cell);
+        let here = self.alike::<L>(numbers, lanes);
+        if let (true, Soil::Codes(codes)) = (here.bits() == lanes.bits(), self.last.1) {
+            return Rough::of_codes(&codes, at, lanes);
+        }
         let mut rough = Rough::none();
         let mut rest = lanes;
         while rest.any() {
@@ -269,18 +293,8 @@ impl<'a> Tiles<'a> {
             let here = self.alike::<L>(numbers, rest);
             match self.last.1 {
                 Soil::Codes(codes) => {
-                    let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
-                    let south = L::I::gather_pairs(codes.posts, at, here);
-                    let north = L::I::gather_pairs(codes.posts, north, here);
-                    let read = [
-                        south & low,
-                        south.shr(sixteen) & low,
-                        north & low,
-                        north.shr(sixteen) & low,
-                    ];
-                    let highest = read[0].max(read[1]).max(read[2].max(read[3]));
-                    let solid = highest.lt(L::I::splat(i32::from(VOID)));
-                    corners.solid = corners.solid | (here & solid);
+                    let (read, solid) = read_pairs::<L>(&codes, at, here);
+                    corners.solid = corners.solid | solid;
                     for n in 0..4 {
                         let height = heights::<L>(&codes, read[n]);
                         corners.heights[n] = L::D::select(here, height, corners.heights[n]);
@@ -309,6 +323,17 @@ impl<'a> Tiles<'a> {
         }
         corners
     }
+}
+
+/// Codes of the corners of cells, and those that have a surface.
+#[inline(always)]
+fn read_pairs<L: Lanes>(codes: &Codes, at: L::I, lanes: L::M) -> ([L::I; 4], L::M) {
+    let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
+    let south = L::I::gather_pairs(codes.posts, at, lanes);
+    let north = L::I::gather_pairs(codes.posts, at + L::I::splat(TILE_POSTS as i32), lanes);
+    let read = [south & low, south.shr(sixteen) & low, north & low, north.shr(sixteen) & low];
+    let highest = read[0].max(read[1]).max(read[2].max(read[3]));
+    (read, lanes & highest.lt(L::I::splat(i32::from(VOID))))
 }
 
 /// Heights of codes, metres, within four roundings.

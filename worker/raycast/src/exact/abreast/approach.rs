@@ -12,29 +12,36 @@
 //! `|rate| <= 1`, `from` in [0, 1] and `v <= FARTHEST`; lines are crossed at
 //! `v = (line - from) inverse`. `from` rounds by at most 2^-24 cells. The difference, `inverse`
 //! and their product, `rate`, its product with v and the sum round once each, by at most
-//! 2^-24 of something that is no larger than `FARTHEST + 1` cells: together less than
-//! [`BLUR`]. The twin's own rounding is below [`SURE_SLACK`], a thousandth of that; else
+//! 2^-24 of something that is no larger than `FARTHEST + 1` cells, and the way to the first
+//! line by 2^-24 of a cell: together less than [`BLUR`]. The twin's own rounding is below [`SURE_SLACK`], a thousandth of that; else
 //! there is no approach.
 //!
 //! **The same cells.** A crossing is off by at most `BLUR` across its line, hence by
 //! `BLUR |inverse|` in v, and its place along the line by `doubt = BLUR (1 + |inverse|)`. A
 //! block is left by the line that is crossed first; where that place is further than
 //! `doubt` from every line across it, the ray crosses between the same two lines, and
-//! enters the same cell. Where it is not, the approach ends.
+//! enters the same cell. A ray that is in a cell goes on to the next along the axis whose
+//! line it crosses first; which one that is, is sure if both crossings are further apart
+//! than `tie`, more than both may be off together. Where it is not, the approach ends. It
+//! also ends by `tie` before the course does: so the line was crossed on the course, and
+//! there is a cell behind it.
 //!
 //! **Nothing is met in a block.** The ray's height is replaced by its tangent at the start,
 //! which is nowhere above it within a span (`path`), but for rounding. So in a block it is at least
 //! the lesser of those at both ends; these are off by up to `doubt` in v, so
-//! `doubt |slope|` is taken off.
+//! `doubt |slope|` is taken off, from the start on.
 //!
 //! **Nor in a cell.** There the height of the tangent above the surface is a parabola,
 //! which hangs below the line through its ends by a quarter of its bend at most. Places
 //! are off by `doubt` along each axis, the ends by as much again, and the surface is no
 //! steeper than the cell's range of heights for each cell: that is six times
-//! `doubt range`; eight are asked for.
+//! `doubt range`; eight are asked for. The gap where a cell is entered is the one where the
+//! last was left, which the surface does not change on their line: it is taken over, less the
+//! eight of the last cell, unless that has no surface.
 //!
 //! **Heights.** Those of posts round four times, the ray's and the surface's and what is
-//! made of them less than twenty times, by 2^-24 of twice the largest height. [`ROUGHNESS`]
+//! made of them less than twenty times, by 2^-24 of twice the largest height or less. That
+//! holds too where they are counted in steps above the lowest of their tile. [`ROUGHNESS`]
 //! is 64 times 2^-24; it is taken off at the start, with the twin's own clearance.
 //!
 //! What overflows becomes infinite or NaN, which clears nothing.
@@ -49,7 +56,7 @@ use terrafarm_terrain::tile::MAXIMA_LEVELS;
 /// The longest approach, cells along the axis of the larger rate.
 pub(super) const FARTHEST: f64 = 250.0;
 /// Bound of all rounding in positions, cells: more than 6 x 251 x 2^-24.
-const BLUR: f32 = 1.0 / 8192.0;
+pub(super) const BLUR: f32 = 1.0 / 8192.0;
 /// Bound of the twin's own rounding, cells.
 pub(super) const SURE_SLACK: f64 = 1.0 / (1 << 22) as f64;
 /// Share by which heights may differ in f32, that of the ray and those of posts together.
@@ -62,30 +69,44 @@ const STEEPEST: f32 = 1e30;
 pub(super) struct Approach<L: Lanes> {
     pub(super) active: L::M,
     /// The cell in which the ray began.
-    base: [L::I; 2],
+    pub(super) base: [L::I; 2],
     pub(super) cell: [L::I; 2],
+    /// The same from `base` on.
+    pub(super) place: [L::F; 2],
     level: L::I,
-    /// How far the ray has come ...
-    v: L::F,
-    /// ... and a bound of its height there.
-    low: L::F,
-    from: [L::F; 2],
-    rate: [L::F; 2],
-    inverse: [L::F; 2],
-    ahead: [L::I; 2],
-    /// Within which crossings of the lines of an axis are known, along them.
+    /// How far the ray has come.
+    pub(super) v: L::F,
+    /// How far the ray is above the surface there, at least ...
+    gap: L::F,
+    /// ... but for lanes that come from a block, or from where there is no surface.
+    pub(super) fresh: L::M,
+    pub(super) from: [L::F; 2],
+    pub(super) rate: [L::F; 2],
+    pub(super) inverse: [L::F; 2],
+    /// 1 along an axis on which the index of the cell grows, else 0 ...
+    pub(super) ahead: [L::I; 2],
+    /// ... and the way from `from` to the line ahead of the first cell.
+    toward: [L::F; 2],
+    /// Within which crossings of the lines of an axis are known, along them ...
     doubt: [L::F; 2],
+    /// ... which counts so much in heights, for each metre of range ...
+    blur: L::F,
+    /// ... and within which the crossings of both are, as v.
+    pub(super) tie: L::F,
+    /// Minus 1/4 of the product of the rates.
+    turn: L::F,
     height: L::F,
-    slope: L::F,
-    reach: L::F,
+    pub(super) slope: L::F,
+    pub(super) reach: L::F,
 }
 
 /// Where lanes leave their blocks.
 struct Exits<L: Lanes> {
-    lines: [L::I; 2],
+    /// Where lines of either axis are crossed.
+    lines: [L::F; 2],
+    /// Where the first is.
     v: L::F,
     low: L::F,
-    doubt: L::F,
     north: L::M,
 }
 
@@ -100,22 +121,30 @@ impl<L: Lanes> Approach<L> {
         let reach = ((last - begin) * pace).min(L::D::splat(FARTHEST)).to_floats();
         let may = begin.lt(last) & slope.abs().lt(L::F::splat(STEEPEST));
         let sure = sight.slack[0].max(sight.slack[1]) < SURE_SLACK;
+        let active = if sure { may } else { L::M::none() };
         let size = z.abs() + L::D::splat(sight.largest);
         let room = L::D::splat(CLEARANCE_M) + L::D::splat(ROUGHNESS) * size;
         let low = (z - room).to_floats();
         let (none, zero) = (L::F::splat(0.0), L::I::splat(0));
-        let mut approach = Approach {
-            active: if sure { may } else { L::M::none() },
+        let blur = L::F::splat(BLUR);
+        let mut approach = Approach::<L> {
+            active,
             base: [zero; 2],
             cell: [zero; 2],
+            place: [none; 2],
             level: zero,
             v: none,
-            low,
+            gap: none,
+            fresh: active,
             from: [none; 2],
             rate: [none; 2],
             inverse: [none; 2],
             ahead: [zero; 2],
+            toward: [none; 2],
             doubt: [none; 2],
+            blur: none,
+            tie: none,
+            turn: none,
             height: low,
             slope,
             reach,
@@ -127,39 +156,68 @@ impl<L: Lanes> Approach<L> {
             let last = L::I::splat(sight.cells[axis] - 1);
             let cell = cell_at::<L>(position, slack, ahead, last);
             let inverse = (inverse[axis] * pace).to_floats();
+            let from = (position - L::D::from_ints(cell)).to_floats();
             approach.base[axis] = cell;
             approach.cell[axis] = cell;
-            approach.from[axis] = (position - L::D::from_ints(cell)).to_floats();
+            approach.from[axis] = from;
             approach.rate[axis] = (rate[axis] * along).to_floats();
             approach.inverse[axis] = inverse;
             approach.ahead[axis] = L::I::select(ahead, L::I::splat(1), zero);
-            approach.doubt[axis] = L::F::splat(BLUR) * (L::F::splat(1.0) + inverse.abs());
+            let line: L::F = approach.ahead[axis].to_floats();
+            approach.toward[axis] = line - from;
+            approach.doubt[axis] = blur * (L::F::splat(1.0) + inverse.abs());
         }
+        let doubt = approach.doubt[0].max(approach.doubt[1]);
+        approach.blur = L::F::splat(8.0) * doubt;
+        approach.tie = approach.doubt[0] + approach.doubt[1];
+        approach.reach = reach - approach.tie;
+        approach.height = low - doubt * slope.abs();
+        approach.turn = L::F::splat(-0.25) * approach.rate[0] * approach.rate[1];
         approach
     }
 
-    /// Where the rays leave the blocks that they are in, by one of two lines.
+    /// Where the rays cross lines, by how far these are from the lines ahead of the first
+    /// cells.
     #[inline(always)]
-    fn exits(&self, lines: [L::I; 2]) -> Exits<L> {
-        let x = ((lines[0] - self.base[0]).to_floats() - self.from[0]) * self.inverse[0];
-        let y = ((lines[1] - self.base[1]).to_floats() - self.from[1]) * self.inverse[1];
-        let north = y.lt(x);
+    fn exits(&self, lines: [L::F; 2]) -> Exits<L> {
+        let x = (lines[0] + self.toward[0]) * self.inverse[0];
+        let y = (lines[1] + self.toward[1]) * self.inverse[1];
         let v = y.min(x);
-        let doubt = L::F::select(north, self.doubt[1], self.doubt[0]);
-        let low = self.height + v * self.slope - doubt * self.slope.abs();
-        Exits { lines, v, low, doubt, north }
+        Exits { lines: [x, y], v, low: self.low(v), north: y.lt(x) }
+    }
+
+    /// Bounds of the heights of rays.
+    #[inline(always)]
+    pub(super) fn low(&self, v: L::F) -> L::F {
+        self.height + v * self.slope
     }
 
     /// Takes lanes, all of which are at a cell, a step further. Returns how many.
     #[inline(always)]
-    pub(super) fn step_cells(&mut self, sight: &Sight, tiles: &mut Tiles) -> u64 {
+    pub(super) fn step_cells(&mut self, tiles: &mut Tiles) -> u64 {
         let taken = self.active;
-        let lines = [self.cell[0] + self.ahead[0], self.cell[1] + self.ahead[1]];
-        let exits = self.exits(lines);
+        let exits = self.exits(self.place);
         let rough = tiles.rough_corners::<L>(self.cell, taken);
-        let clear = (self.misses(&rough, &exits) | !rough.solid) & !rough.absent;
-        self.active = self.pass(sight, &exits, taken & clear);
+        let clear = (self.misses(&rough, &exits, self.fresh) | !rough.solid) & !rough.absent;
+        let [x, y] = exits.lines;
+        let sure = self.tie.lt(x.max(y) - exits.v);
+        let moving = taken & clear & sure & exits.v.lt(self.reach);
+        self.go(0, moving & !exits.north);
+        self.go(1, moving & exits.north);
+        self.v = exits.v;
+        self.fresh = moving & !rough.solid;
+        self.active = moving;
         u64::from(taken.count())
+    }
+
+    /// Goes on to the next cell along an axis.
+    #[inline(always)]
+    fn go(&mut self, axis: usize, lanes: L::M) {
+        let one = L::I::splat(1);
+        let ahead = self.ahead[axis];
+        let cell = self.cell[axis] + (ahead + ahead - one);
+        self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
+        self.place[axis] = (self.cell[axis] - self.base[axis]).to_floats();
     }
 
     /// Takes lanes, at blocks and cells, a step further. Returns how many.
@@ -170,18 +228,19 @@ impl<L: Lanes> Approach<L> {
         let cells = taken & self.level.eq(zero);
         let blocks = taken & !cells;
         let lines = [
-            (self.cell[0].shr(self.level) + self.ahead[0]).shl(self.level),
-            (self.cell[1].shr(self.level) + self.ahead[1]).shl(self.level),
+            (self.cell[0].shr(self.level) + self.ahead[0]).shl(self.level) - self.ahead[0],
+            (self.cell[1].shr(self.level) + self.ahead[1]).shl(self.level) - self.ahead[1],
         ];
-        let exits = self.exits(lines);
+        let exits = self
+            .exits([(lines[0] - self.base[0]).to_floats(), (lines[1] - self.base[1]).to_floats()]);
         let rough = tiles.rough::<L>(self.cell, self.level, blocks, cells);
-        let passed = rough.highest.lt(self.low.min(exits.low));
-        let missed = self.misses(&rough, &exits) | !rough.solid;
+        let passed = rough.highest.lt(self.low(self.v).min(exits.low));
+        let missed = self.misses(&rough, &exits, cells) | !rough.solid;
         let clear = ((blocks & passed) | (cells & missed)) & !rough.absent;
         let down = blocks & !clear & !rough.absent;
         self.level = L::I::select(down, self.level - one, self.level);
         let before = self.cell;
-        let moved = self.pass(sight, &exits, clear);
+        let moved = self.pass(sight, lines, &exits, clear);
         let parent = self.level + one;
         let same_x = before[0].shr(parent).eq(self.cell[0].shr(parent));
         let same_y = before[1].shr(parent).eq(self.cell[1].shr(parent));
@@ -193,37 +252,42 @@ impl<L: Lanes> Approach<L> {
 
     /// Which lanes are seen to be above the surface all through their cells.
     #[inline(always)]
-    fn misses(&self, rough: &Rough<L>, exits: &Exits<L>) -> L::M {
+    fn misses(&mut self, rough: &Rough<L>, exits: &Exits<L>, fresh: L::M) -> L::M {
         let [sw, se, nw, ne] = rough.heights;
-        let zero = L::F::splat(0.0);
-        let (x, y) =
-            ((self.cell[0] - self.base[0]).to_floats(), (self.cell[1] - self.base[1]).to_floats());
-        let (from_x, from_y) = (self.from[0] - x, self.from[1] - y);
-        let (south, north) = (se - sw, ne - nw);
-        let x0 = from_x + self.v * self.rate[0];
-        let y0 = from_y + self.v * self.rate[1];
-        let x1 = from_x + exits.v * self.rate[0];
-        let y1 = from_y + exits.v * self.rate[1];
-        let (start_s, start_n) = (sw + south * x0, nw + north * x0);
-        let (end_s, end_n) = (sw + south * x1, nw + north * x1);
-        let start = start_s + (start_n - start_s) * y0;
-        let end = end_s + (end_n - end_s) * y1;
-        let curl = (north - south) * (x1 - x0) * (y1 - y0);
-        let sag = L::F::splat(0.25) * (zero - curl).max(zero);
+        if fresh.any() {
+            let gap = self.low(self.v) - self.surface(rough, self.v);
+            self.gap = L::F::select(fresh, gap, self.gap);
+        }
+        let gap = exits.low - self.surface(rough, exits.v);
+        let length = exits.v - self.v;
+        let twist = (ne - nw) - (se - sw);
+        let sag = twist * self.turn * (length * length);
         let range = sw.max(se).max(nw.max(ne)) - sw.min(se).min(nw.min(ne));
-        let doubt = self.doubt[0].max(self.doubt[1]);
-        let room = sag + L::F::splat(8.0) * doubt * range;
-        let least = (self.low - start).min(exits.low - end);
-        room.lt(least)
+        let blur = self.blur * range;
+        let room = rough.scale * (blur + sag.max(L::F::splat(0.0)));
+        let missed = room.lt(self.gap.min(gap));
+        self.gap = gap - rough.scale * blur;
+        missed
+    }
+
+    /// Heights of the surface where rays are within their cells.
+    #[inline(always)]
+    fn surface(&self, rough: &Rough<L>, v: L::F) -> L::F {
+        let [sw, se, nw, ne] = rough.heights;
+        let x = (self.from[0] - self.place[0]) + v * self.rate[0];
+        let y = (self.from[1] - self.place[1]) + v * self.rate[1];
+        let (south, north) = (sw + (se - sw) * x, nw + (ne - nw) * x);
+        rough.base + rough.scale * (south + (north - south) * y)
     }
 
     /// Goes on behind blocks; returns the lanes that may.
     #[inline(always)]
-    fn pass(&mut self, sight: &Sight, exits: &Exits<L>, lanes: L::M) -> L::M {
+    fn pass(&mut self, sight: &Sight, lines: [L::I; 2], exits: &Exits<L>, lanes: L::M) -> L::M {
         let (zero, one) = (L::I::splat(0), L::I::splat(1));
         let north = exits.north;
-        let line = L::I::select(north, exits.lines[1], exits.lines[0]);
-        let after = line - one + L::I::select(north, self.ahead[1], self.ahead[0]);
+        let line = L::I::select(north, lines[1], lines[0]);
+        let ahead = L::I::select(north, self.ahead[1], self.ahead[0]);
+        let after = line + ahead + ahead - one;
         let (columns, rows) = (L::I::splat(sight.cells[0]), L::I::splat(sight.cells[1]));
         let counts = L::I::select(north, rows, columns);
         let outside = after.lt(zero) | !after.lt(counts);
@@ -233,14 +297,17 @@ impl<L: Lanes> Approach<L> {
         let place = from + exits.v * rate;
         let floor = place.floor();
         let part = place - floor.to_floats();
-        let sure = exits.doubt.lt(part) & part.lt(L::F::splat(1.0) - exits.doubt);
+        let doubt = L::F::select(north, self.doubt[1], self.doubt[0]);
+        let sure = doubt.lt(part) & part.lt(L::F::splat(1.0) - doubt);
         let near = exits.v.lt(self.reach);
         let beside = floor + L::I::select(north, self.base[0], self.base[1]);
         let moving = lanes & sure & near & !outside;
         self.v = L::F::select(moving, exits.v, self.v);
-        self.low = L::F::select(moving, exits.low, self.low);
         self.cell[0] = L::I::select(moving, L::I::select(north, beside, after), self.cell[0]);
         self.cell[1] = L::I::select(moving, L::I::select(north, after, beside), self.cell[1]);
+        for axis in 0..2 {
+            self.place[axis] = (self.cell[axis] - self.base[axis]).to_floats();
+        }
         moving
     }
 }

@@ -1,10 +1,10 @@
 //! A vector of rays on their way over blocks and cells: a step of each kind.
 
 use super::Sight;
-use crate::exact::CLEARANCE_M;
 use crate::exact::arc::{Rise, Spans};
 use crate::exact::rays::{Part, Rays};
 use crate::exact::tiles::Tiles;
+use crate::exact::{CLEARANCE_M, FIRST_LEVEL};
 use crate::lanes::{Doubles, Ints, Lanes, MOST, Mask};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
@@ -141,7 +141,8 @@ impl<L: Lanes> Walk<L> {
         let number = L::D::splat(0.0).refill(&RANKS, lanes).truncate() + L::I::splat(at as i32);
         self.ray = L::I::select(lanes, number, self.ray);
         let zero = L::I::splat(0);
-        self.level = L::I::select(lanes, zero, self.level);
+        let level = L::I::splat(FIRST_LEVEL as i32);
+        self.level = L::I::select(lanes, level, self.level);
         for axis in 0..2 {
             let forward = L::D::splat(0.0).lt(self.rate[axis]);
             self.ahead[axis] = L::I::select(forward, L::I::splat(1), zero);
