@@ -179,6 +179,7 @@ fn parts(region: Region, by_rows: bool) -> impl Iterator<Item = [Range<u32>; 2]>
 }
 
 /// For each row of a band within a part its pixels, and the lines that they lie between.
+#[inline(always)]
 fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 2]) -> Vec<Span> {
     let rows = band.rows.start.max(majors.start)..band.rows.end.min(majors.end);
     let span = |row: u32| {
@@ -187,8 +188,8 @@ fn spans(frame: &Frame, band: &Band, fan: &Fan, [minors, majors]: &[Range<u32>; 
             return Span { pixels, lines: 0..0 };
         }
         let middle = f64::from(row) + 0.5;
-        let line = |pixel: u32| fan.line(f64::from(pixel) + 0.5, middle);
-        let (a, b) = (line(pixels.start), line(pixels.end - 1));
+        let [a, b] =
+            fan.lines([pixels.start, pixels.end - 1].map(|at| f64::from(at) + 0.5), middle);
         // One more on each side to compare with, and one makes up for rounding.
         let lines = a.min(b).floor() as i32 - 2..a.max(b).floor() as i32 + 4;
         Span { pixels, lines }
@@ -209,25 +210,30 @@ impl Columns<'_, '_> {
         net: &mut Net,
         seen: &mut Seen,
     ) -> Rules {
-        let filled = || spans.iter().zip(first_row..).filter(|(span, _)| !span.pixels.is_empty());
         // One more on each side to compare with, and what may come up from below.
         let rising = self.rises(frame, fan);
         let reach = (REACH * fan.spacing).ceil() as i32;
         let (before, after) = if rising { (reach + 1, 1) } else { (1, reach + 1) };
         let rays = |row: u32| fan.ray(row) - before..fan.ray(row) + after + 1;
-        let first_ray = filled().map(|(_, row)| rays(row).start).min().unwrap_or(0);
-        let end_ray = filled().map(|(_, row)| rays(row).end).max().unwrap_or(0);
-        let first_line = filled().map(|(span, _)| span.lines.start).min().unwrap_or(0);
-        let end_line = filled().map(|(span, _)| span.lines.end).max().unwrap_or(0);
-        net.clear(first_ray, (end_ray - first_ray) as usize, first_line..end_line);
+        // From row to row it is the next ray, so the first and the last row tell.
+        let rays_of = |meets: &dyn Fn(&Span) -> bool| {
+            let (first, last) = (spans.iter().position(meets)?, spans.iter().rposition(meets)?);
+            let [a, b] = [first, last].map(|at| rays(first_row + at as u32));
+            Some(a.start.min(b.start)..a.end.max(b.end))
+        };
+        let filled = || spans.iter().filter(|span| !span.pixels.is_empty());
+        let all_rays = rays_of(&|span| !span.pixels.is_empty()).unwrap_or(0..0);
+        let first_line = filled().map(|span| span.lines.start).min().unwrap_or(0);
+        let end_line = filled().map(|span| span.lines.end).max().unwrap_or(0);
+        net.clear(all_rays.start, all_rays.len(), first_line..end_line);
         for block in (first_line..end_line).step_by(L::N) {
             let end = block + L::N as i32;
-            let meets = |(span, _): &(&Span, u32)| span.lines.start < end && span.lines.end > block;
-            let low = filled().filter(meets).map(|(_, row)| rays(row).start).min();
-            let high = filled().filter(meets).map(|(_, row)| rays(row).end).max();
-            if let (Some(low), Some(high)) = (low, high) {
-                seen.rays += (high - low) as u64 * L::N as u64;
-                seen.steps += self.block::<L>(frame, fan, block, low..high, net);
+            let meets = |span: &Span| {
+                !span.pixels.is_empty() && span.lines.start < end && span.lines.end > block
+            };
+            if let Some(rays) = rays_of(&meets) {
+                seen.rays += rays.len() as u64 * L::N as u64;
+                seen.steps += self.block::<L>(frame, fan, block, rays, net);
             }
         }
         let bends = BENDS * self.tolerance_px;

@@ -208,9 +208,11 @@ impl Fan {
         apart as i32 * self.towards
     }
 
-    /// The line through a point of a row, as a number that counts from line 0.
-    pub(crate) fn line(&self, minor: f64, row: f64) -> f64 {
+    /// The lines through points of a row, as numbers that count from line 0.
+    #[inline]
+    pub(crate) fn lines(&self, minors: [f64; 2], row: f64) -> [f64; 2] {
         let d = row - self.reference;
-        (minor + d * self.r) / (1.0 + d * self.q) / self.spacing - 0.5
+        let scale = 1.0 / ((1.0 + d * self.q) * self.spacing);
+        minors.map(|minor| (minor + d * self.r) * scale - 0.5)
     }
 }
