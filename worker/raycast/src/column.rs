@@ -61,7 +61,7 @@ const DENSEST: f64 = 1.85;
 /// The widest part of a region that is done at once, pixels: its rays fit a cache of 1 MB.
 const WIDEST_PX: u32 = 256;
 
-/// The most that a thread keeps from region to region: four times what one of 256 by 1080
+/// The most that a thread keeps from region to region: several times what one of 256 by 1080
 /// pixels needs.
 const KEPT_BYTES: usize = 16 << 20;
 

@@ -276,3 +276,52 @@ pub(super) fn same<L: Lanes>(a: L::F, b: L::F) -> L::M {
 fn below(row: usize, by: usize, rows: usize, rising: bool) -> Option<usize> {
     if rising { row.checked_sub(by) } else { Some(row + by).filter(|&row| row < rows) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lanes::One;
+    use crate::oracle::Dice;
+
+    #[test]
+    fn ground_with_one_bend_is_even_only_where_the_line_is_off_by_no_more_than_allowed() {
+        const LINES: i32 = 24;
+        let of_depth = 1e-3;
+        let rules = Rules { bends: Bends { of_change: 0.0, of_depth }, rising: false, reach: 1 };
+        let (mut net, mut verdict) = (Net::default(), Verdict::default());
+        let mut dice = Dice::new(5);
+        // Intervals with the bend inside: even, and not; and those beside them that are even.
+        let (mut even, mut bent, mut beside) = (0, 0, 0);
+        for _ in 0..4000 {
+            let (nearest, slope) = (dice.between(1e-3, 2e-3), dice.between(-2e-6, 2e-6));
+            let (place, bend) = (dice.between(4.0, 19.0), dice.between(-9e-6, 9e-6));
+            let ground = |x: f64| nearest + slope * x + bend * (x - place).max(0.0);
+            net.clear(0, 3, 0..LINES);
+            for row in 0..3 {
+                for line in 0..LINES {
+                    let bits = (ground(f64::from(line)) as f32).to_bits() as i32;
+                    let at = net.place(row, line) as usize;
+                    net.answers[at] = f32::from_bits((bits & !3 | TOLD | WHOLE) as u32);
+                }
+            }
+            net.find_tips::<One>(rules.rising);
+            net.judge::<One>(1, rules, &mut verdict);
+            for line in 1..LINES - 2 {
+                let (a, b) = (ground(f64::from(line)), ground(f64::from(line + 1)));
+                let off = (0..=16)
+                    .map(|n| f64::from(n) / 16.0)
+                    .map(|t| (a + (b - a) * t - ground(f64::from(line) + t)).abs());
+                let off = off.fold(0.0, f64::max);
+                let inside = (place.floor() as i32) == line;
+                let is_even = verdict.states[line as usize] == EVEN;
+                even += i32::from(inside && is_even);
+                bent += i32::from(inside && !is_even);
+                beside += i32::from((place.floor() as i32 - line).abs() == 1 && is_even);
+                // Half of what is allowed at both rays, and the rounding of answers.
+                let most = 0.5 * f64::from(of_depth) * a.min(b) + 4e-9;
+                assert!(!is_even || off <= most, "{off} above {most}: {line}, {place} {bend}");
+            }
+        }
+        assert!(even > 500 && bent > 500 && beside > 4000, "{even} {bent} {beside}");
+    }
+}
