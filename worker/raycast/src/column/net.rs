@@ -23,8 +23,6 @@ pub(crate) const WHOLE: i32 = 2;
 /// ... posts are further apart there than rays.
 pub(crate) const TOLD: i32 = 1;
 
-/// Answers in a line of the cache.
-const LINE: usize = 16;
 /// How many times more answers must bend than straight lines may, for two rays to see
 /// different ground.
 const TORN: f32 = 8.0;
@@ -62,8 +60,6 @@ pub(super) struct Net {
     /// One over the depths; 0 for the sky, NaN where a tile is missing. The last two bits
     /// are [`WHOLE`] and [`TOLD`].
     pub answers: Vec<f32>,
-    /// Where the first row begins: at a line of the cache.
-    start: usize,
     /// Closer ground that ends a row lower, else 0; of rows that have any ...
     tips: Vec<f32>,
     tipped: Vec<bool>,
@@ -74,7 +70,7 @@ pub(super) struct Net {
     /// Answers of a row, and how many of them are of lines that pixels lie between.
     pub width: usize,
     lines: usize,
-    pub first_row: i32,
+    first_row: i32,
     pub first_line: i32,
 }
 
@@ -94,13 +90,11 @@ impl Net {
     pub fn clear(&mut self, first_row: i32, rows: usize, lines: Range<i32>) {
         (self.first_row, self.first_line, self.lines) = (first_row, lines.start, lines.len());
         // Whole vectors are looked at, and twice as much.
-        self.width = pitch(self.lines + 2 * MOST);
-        let width = self.width;
-        // Besides what is lost by the start, a margin for the vectors beyond the end.
-        let count = width * rows + LINE + 2 * MOST;
+        self.width = self.lines + 2 * MOST;
+        // A margin for the vectors beyond the end.
+        let count = self.width * rows + 2 * MOST;
         self.answers.clear();
         self.answers.resize(count, 0.0);
-        self.start = self.answers.as_ptr().align_offset(LINE * size_of::<f32>()) % LINE;
         for list in [&mut self.tips, &mut self.peaks] {
             list.resize(count, 0.0);
         }
@@ -122,22 +116,21 @@ impl Net {
 
     /// Where the answer of a ray of a line belongs.
     pub fn place(&self, row: i32, line: i32) -> i32 {
-        let row = (row - self.first_row) * self.width as i32;
-        self.start as i32 + row + (line - self.first_line)
+        (row - self.first_row) * self.width as i32 + (line - self.first_line)
     }
 
     /// The answers of a row.
     #[inline(always)]
     pub fn row(&self, row: i32) -> &[f32] {
-        let at = self.start + (row - self.first_row) as usize * self.width;
+        let at = (row - self.first_row) as usize * self.width;
         &self.answers[at..at + self.width]
     }
 
     /// Looks for ground behind which there is other ground, once all rays are cast.
     #[inline(always)]
     pub fn find_tips<L: Lanes>(&mut self, rising: bool) {
-        let Net { answers, start, tips, tipped, peaks, peaked, width, lines, .. } = self;
-        let (width, rows, answers) = (*width, tipped.len(), &answers[*start..]);
+        let Net { answers, tips, tipped, peaks, peaked, width, lines, .. } = self;
+        let (width, rows) = (*width, tipped.len());
         let load = |at: usize| L::F::load(&answers[at..]);
         let (zero, neighbours) = (L::F::splat(0.0), L::F::splat(1.0 - NEIGHBOURS));
         for row in 0..rows {
@@ -195,8 +188,7 @@ impl Net {
         let rows = self.rows();
         let after = if row + 1 < rows { row + 1 } else { row.saturating_sub(1) };
         let before = if row > 0 { row - 1 } else { after };
-        let answers = &self.answers[self.start..];
-        let [before, row, after] = [before, row, after].map(|row| &answers[row * width..]);
+        let [before, row, after] = [before, row, after].map(|row| &self.answers[row * width..]);
         for column in (1..=self.lines).step_by(L::N) {
             let here = L::F::load(&row[column..]);
             let beside = L::F::load(&row[column - 1..]) + L::F::load(&row[column + 1..]);
@@ -257,12 +249,6 @@ impl Net {
             }
         }
     }
-}
-
-/// How many answers there are to be in a row for so many lines: whole lines of the cache, an
-/// odd number of them, or rays one behind another would meet in few of its sets.
-fn pitch(lines: usize) -> usize {
-    (lines.div_ceil(LINE) | 1) * LINE
 }
 
 /// Whether two answers are of the same ground.
