@@ -298,6 +298,30 @@ impl Timesheet {
         sum(&mut self.other_us, more.other_us);
     }
 
+    /// What of it can have been within the last so many microseconds: what is more was before
+    /// these. A worker that is told of a shot may still be busy with a job that was taken
+    /// back, so that goes first.
+    pub fn within(mut self, most_us: u64) -> Timesheet {
+        let mut before = self.total_us().saturating_sub(most_us);
+        let parts = [
+            &mut self.redo_us,
+            &mut self.idle_us,
+            &mut self.other_us,
+            &mut self.send_us,
+            &mut self.terrain_us,
+            &mut self.unpack_us,
+            &mut self.pack_us,
+            &mut self.coreless_us,
+            &mut self.render_us,
+        ];
+        for part in parts {
+            let less = before.min(*part);
+            *part -= less;
+            before -= less;
+        }
+        self
+    }
+
     /// The same time for a result that was refused: rendering and packing were for nothing.
     pub fn wasted(self) -> Timesheet {
         let lost = [self.render_us, self.coreless_us, self.pack_us];
@@ -436,5 +460,22 @@ impl Body for HandBack {
 
     fn check(&self) -> Result<(), Unfit> {
         Unfit::unless(self.leases.len() <= HAND_BACK_MAX, "too many leases in one message")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_more_than_has_passed_was_before_and_was_for_jobs_taken_back_first() {
+        let sheet = Timesheet { idle_us: 10, render_us: 100, redo_us: 40, ..Timesheet::default() };
+        assert_eq!(sheet.within(150), sheet);
+        assert_eq!(sheet.within(120), Timesheet { redo_us: 10, ..sheet });
+        let rendered = Timesheet { redo_us: 0, idle_us: 0, render_us: 70, ..sheet };
+        assert_eq!(sheet.within(70), rendered);
+        for most_us in 0..200 {
+            assert_eq!(sheet.within(most_us).total_us(), most_us.min(150));
+        }
     }
 }
