@@ -41,10 +41,10 @@ use terrafarm_terrain::tile::{HeightTile, MAXIMA_LEVELS};
 /// How far above a block's maximum a ray must stay for the block to be skipped, metres.
 /// Rounding in heights and positions is below 1e-8 m; a skip lost to it costs nothing.
 const CLEARANCE_M: f64 = 1e-6;
-/// Level at which a walk begins. Measured with `examples/bench.rs`: beams come
-/// close to the ground, and 4 takes a quarter longer over a steep view. Abreast, where most
-/// of those that have to walk pass far over the ground, 0 takes a twentieth longer over a low
-/// view.
+/// Level at which a walk begins, and the blocks of an approach. Measured with
+/// `examples/bench.rs`: beams come close to the ground, and 4 takes a quarter longer over a
+/// steep view. Abreast, where most of those that have to walk pass far over the ground, 0 takes
+/// a twentieth longer over a low view.
 const FIRST_LEVEL: usize = 2;
 
 /// Casts rays, one after another.

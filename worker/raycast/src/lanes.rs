@@ -153,10 +153,35 @@ pub(crate) trait Ints:
     /// For each lane in `mask` the elements `at` and `at + 1` of a table of at least two;
     /// lanes outside get 0. An index outside the table reads from its end.
     fn gather_twos(table: &[u32], at: Self, mask: Self::M) -> (Self, Self);
-    /// For each lane in `mask` the elements `at` to `at + 3` of a table, as pairs, and those
-    /// `stride` elements on, and again, four times; lanes outside get 0. An index outside
-    /// the table reads from its end. Panics if the table has fewer than 3 `stride` + 4.
-    fn gather_rows(table: &[u16], at: Self, stride: usize, mask: Self::M) -> [(Self, Self); 4];
+    /// For each lane in `mask` the elements around a cell of a table of rows `stride` long, as
+    /// pairs: two of the first of four rows, above these and beside them four of the second
+    /// (west, east) and of the third, and two of the last. `at` is the column of the four's
+    /// first, and from bit 16 on the first row. Lanes outside get anything, and so does a
+    /// lane whose elements are not all in the table. Panics if the table has less than eight
+    /// rows and an element, or these less than eight elements or 2^15 and more.
+    fn gather_around(table: &[u16], at: Self, stride: usize, mask: Self::M) -> [Self; 6];
+
+    /// The corner of the square, eight rows of eight elements of a table, that has the places
+    /// from `low` to `high` of all lanes in `mask`, at most `limit`; and whether there is one:
+    /// never at widths whose lanes do not pick from vectors. Places are columns, and from bit 16
+    /// on rows, both unsigned.
+    #[inline(always)]
+    fn corner(_low: Self, _high: Self, _limit: i32, _mask: Self::M) -> (i32, bool) {
+        (0, false)
+    }
+    /// As [`Ints::gather_around`] with places relative to those of the square's corner; all
+    /// lanes' elements are in it. Panics if the square is not in the table.
+    #[inline(always)]
+    fn around_in(_table: &[u16], _first: usize, _stride: usize, _at: Self) -> [Self; 6] {
+        unreachable!("there is no corner")
+    }
+}
+
+/// Panics if a table is not what [`Ints::gather_around`] asks for: eight rows of eight, so that
+/// a square of [`Ints::around_in`] can be in it, too.
+#[inline(always)]
+fn check_rows(table: &[u16], stride: usize) {
+    assert!((8..1 << 15).contains(&stride) && table.len() > 8 * stride, "eight rows of eight");
 }
 
 /// A yes or no a lane.
@@ -290,8 +315,9 @@ impl Anchor {
     }
 }
 
-/// Asks for the memory `at` bytes behind the base of each lane in `mask`, so that it is there
-/// when it is read. Any address will do.
+/// Asks for the memory `at` bytes behind the base of each lane, so that it is there when it is
+/// read, if any lane is in `mask`: of all, for it takes longer to tell which. Any address will
+/// do.
 #[inline(always)]
 pub(crate) fn prefetch<L: Lanes>(bases: &[*const u8; MOST], at: L::I, mask: L::M) {
     #[cfg(target_arch = "x86_64")]
@@ -299,13 +325,12 @@ pub(crate) fn prefetch<L: Lanes>(bases: &[*const u8; MOST], at: L::I, mask: L::M
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         let mut places = [0; MOST];
         at.store(&mut places);
-        let mut bits = mask.bits();
-        while bits != 0 {
-            let lane = bits.trailing_zeros() as usize % MOST;
-            bits &= bits - 1;
-            let place = bases[lane].wrapping_offset(places[lane] as isize);
-            // SAFETY: SSE is part of the architecture, and a hint reads nothing.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(place.cast()) };
+        if mask.any() {
+            for lane in 0..L::N {
+                let place = bases[lane].wrapping_offset(places[lane] as isize);
+                // SAFETY: SSE is part of the architecture, and a hint reads nothing.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(place.cast()) };
+            }
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
@@ -361,6 +386,81 @@ mod tests {
                 lanes.to_floats().pack(L::M::from_bits(bits)).store(&mut floats);
                 assert_eq!(ints[..wanted.len()], wanted);
                 assert_eq!(floats.map(|float| float as i32)[..wanted.len()], wanted);
+            }
+        }
+    }
+
+    /// Reads places close together, out of a square and one by one.
+    struct Picks<'t> {
+        posts: &'t [u16],
+        stride: usize,
+        places: [[i32; 2]; MOST],
+        bits: u32,
+    }
+
+    impl Kernel for Picks<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Lanes>(self) {
+            let Picks { posts, stride, places, bits } = self;
+            let bits = bits & ((1 << L::N) - 1) | 1;
+            let lanes = (0..L::N).filter(|lane| bits >> lane & 1 == 1);
+            let mask = L::M::from_bits(bits);
+            let rows = (posts.len() / stride) as i32;
+            // What lanes outside the mask hold may be anything.
+            let stale = [i32::MIN, -1, i32::MAX, 0][self.bits as usize % 4];
+            let at = L::I::load(&places.map(|[x, y]| y << 16 | x));
+            let at = L::I::select(mask, at, L::I::splat(stale));
+            let check = |around: [L::I; 6]| {
+                let mut found = [[0; MOST]; 6];
+                (0..6).for_each(|n| around[n].store(&mut found[n]));
+                for lane in lanes.clone() {
+                    let first = places[lane][1] as usize * stride + places[lane][0] as usize;
+                    let pairs = [(0, 1), (1, 0), (1, 2), (2, 0), (2, 2), (3, 1)];
+                    let expected = pairs.map(|(row, column)| {
+                        let at = first + row * stride + column;
+                        (u32::from(posts[at]) | u32::from(posts[at + 1]) << 16) as i32
+                    });
+                    assert_eq!(found.map(|pair| pair[lane]), expected);
+                }
+            };
+            check(L::I::gather_around(posts, at, stride, mask));
+            let limit = (rows - 8) << 16 | (stride as i32 - 8);
+            let (corner, is_there) = L::I::corner(at, at + L::I::splat(3 << 16 | 3), limit, mask);
+            let least = [0, 1].map(|axis| {
+                let last = [stride as i32, rows][axis] - 8;
+                lanes.clone().map(|lane| places[lane][axis]).min().map_or(0, |at| at.min(last))
+            });
+            let fits = lanes.clone().all(|lane| (0..2).all(|n| places[lane][n] - least[n] <= 4));
+            assert_eq!(is_there, fits && L::N == MOST);
+            if is_there {
+                assert_eq!(corner, least[1] << 16 | least[0]);
+                let first = least[1] as usize * stride + least[0] as usize;
+                check(L::I::around_in(posts, first, stride, at - L::I::splat(corner)));
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_picked_out_of_a_square_is_what_the_table_has() {
+        let (stride, rows) = (19, 23);
+        let code = |n: u32| (n.wrapping_mul(2_654_435_761) >> 16) as u16;
+        let posts: Vec<u16> = (0..(stride * rows + 1) as u32).map(code).collect();
+        let mut random = 1u32;
+        let mut next = |most: i32| {
+            random = random.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+            (random >> 16) as i32 % (most + 1)
+        };
+        for _ in 0..20_000 {
+            let most = [stride as i32 - 4, rows as i32 - 4];
+            let (from, reach) = ([next(most[0]), next(most[1])], next(7));
+            let places = std::array::from_fn(|_| {
+                [0, 1].map(|axis| (from[axis] + next(reach)).min(most[axis]))
+            });
+            let bits = next(0xFFFF) as u32;
+            for width in Width::available() {
+                run(Picks { posts: &posts, stride, places, bits }, width);
             }
         }
     }

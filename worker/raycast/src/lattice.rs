@@ -16,9 +16,10 @@ use terrafarm_common::camera::Camera;
 
 /// Pixels closer to V than this belong to no band.
 const NEAREST_PX: f64 = 8.0;
-/// A band ends where its lines are closer than this share of the spacing. Not less than
-/// a half: `column` looks N pixels up among 2 N lines.
-const CLOSEST: f64 = 0.55;
+/// A band ends where its lines are closer than this share of the spacing. Measured: with 0.55
+/// a rolled view needs more memory than a thread keeps, with 0.75 the largest error of
+/// `column` grows from 0.45 to 0.73 px, and 0.85 takes a tenth longer over a steep view.
+const CLOSEST: f64 = 0.65;
 
 /// The picture with rows as the major axis, or columns.
 pub(crate) struct Frame {
@@ -167,29 +168,25 @@ impl Frame {
             return none;
         }
         let owns = |minor: u32| self.owns(minor, row);
-        if owns(minors.start) && owns(minors.end - 1) {
+        let (start, last) = (minors.start, minors.end - 1);
+        if owns(start) && owns(last) {
             return minors;
         }
-        let reach = self.apart(f64::from(row) + 0.5).abs();
-        let (a, b) = ((self.v[0] - reach) / self.v[2], (self.v[0] + reach) / self.v[2]);
-        let pixel = |place: f64| (place - 0.5).clamp(-1.0, f64::from(u32::MAX)) as u32;
-        let (mut first, mut last) = (pixel(a.min(b)), pixel(a.max(b)) + 1);
-        first = first.saturating_sub(1).clamp(minors.start, minors.end - 1);
-        last = (last + 1).clamp(minors.start, minors.end - 1);
-        // What is left of rounding.
-        while first < last && !owns(first) {
-            first += 1;
-        }
-        while last > first && !owns(last) {
-            last -= 1;
-        }
-        if owns(first) { first..last + 1 } else { none }
+        // Those that are, if there are any, lie together around the closest to V. That is known
+        // to a pixel; where V is so far away that it is not, it is one of the ends.
+        let closest = (self.v[0] / self.v[2] - 0.5).clamp(0.0, f64::from(u32::MAX)) as u32;
+        let beside = [closest.saturating_sub(1), closest, closest.saturating_add(1)];
+        let [a, b, c] = beside.map(|minor| minor.clamp(start, last));
+        let Some(inside) = [b, a, c, start, last].into_iter().find(|&minor| owns(minor)) else {
+            return none;
+        };
+        turn(start..inside, |minor| !owns(minor))..turn(inside..minors.end, owns)
     }
 }
 
-/// The first of some rows that is not as the ones before it are.
-fn turn(rows: Range<u32>, is: impl Fn(u32) -> bool) -> u32 {
-    let (mut low, mut high) = (rows.start, rows.end);
+/// The first of some numbers that is not as the ones before it are.
+fn turn(numbers: Range<u32>, is: impl Fn(u32) -> bool) -> u32 {
+    let (mut low, mut high) = (numbers.start, numbers.end);
     while low < high {
         let middle = low + (high - low) / 2;
         if is(middle) {
@@ -214,5 +211,53 @@ impl Fan {
         let d = row - self.reference;
         let scale = 1.0 / ((1.0 + d * self.q) * self.spacing);
         minors.map(|minor| (minor + d * self.r) * scale - 0.5)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::oracle::Dice;
+
+    #[test]
+    fn every_pixel_is_owned_by_one_frame_and_found_in_its_row() {
+        const SIZE: (u32, u32) = (320, 180);
+        let mut dice = Dice::new(31);
+        let (mut level, mut parted) = (0, 0);
+        for round in 0..400 {
+            // Level but for rounding, where V is very far away, and rolled so that it lies
+            // across the border between the frames.
+            let pitch = match round % 4 {
+                0 => 0.0,
+                1 => [1e-14, -3e-14, 1e-13, 1e-12, -1e-11][round / 4 % 5],
+                2 => [-90.0, 90.0, -89.999][round / 4 % 3],
+                _ => dice.between(-90.0, 90.0),
+            };
+            let roll = [0.0, 45.0, -45.0, 135.0, 90.0, dice.between(-180.0, 180.0)][round % 6];
+            let eye = DVec3::new(0.0, 0.0, 100.0);
+            let camera = Camera::from_angles(eye, 0.0, pitch, roll, 60.0, SIZE);
+            let frames = [true, false].map(|by_rows| Frame::new(&camera, by_rows));
+            let mut owners = vec![0; (SIZE.0 * SIZE.1) as usize];
+            for (frame, [minors, majors]) in frames.iter().zip([[SIZE.0, SIZE.1], [SIZE.1, SIZE.0]])
+            {
+                for major in 0..majors {
+                    let from = dice.below(u64::from(minors)) as u32;
+                    for part in [0..from, from..minors] {
+                        let owned = frame.owned(major, part.clone());
+                        for minor in part.clone() {
+                            let is = frame.owns(minor, major);
+                            let said = format!("{minor} {major} {part:?} {owned:?} {camera:?}");
+                            assert_eq!(owned.contains(&minor), is, "{said}");
+                            let at = if frame.by_rows { [minor, major] } else { [major, minor] };
+                            owners[(at[1] * SIZE.0 + at[0]) as usize] += u32::from(is);
+                        }
+                        parted += u32::from(!owned.is_empty() && owned.len() < part.len());
+                    }
+                }
+            }
+            assert!(owners.iter().all(|&count| count == 1), "{camera:?}");
+            level += u32::from(pitch.abs() < 1e-10);
+        }
+        assert!(level > 100 && parted > 1000, "{level} {parted}");
     }
 }

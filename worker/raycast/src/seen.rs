@@ -23,7 +23,16 @@ pub(crate) struct Seen {
 impl Seen {
     /// Nothing is known of any pixel.
     pub(crate) fn new(region: Region) -> Self {
-        let inverse_depth = vec![f32::NAN; region.area() as usize];
+        Seen::with(vec![f32::NAN; region.area() as usize])
+    }
+
+    /// The sky, for a method that writes every pixel: memory that is zero need not be written
+    /// before.
+    pub(crate) fn sky(region: Region) -> Self {
+        Seen::with(vec![0.0; region.area() as usize])
+    }
+
+    fn with(inverse_depth: Vec<f32>) -> Self {
         Seen { inverse_depth, steps: 0, rays: 0, alone: 0, coarser: 0 }
     }
 }

@@ -13,6 +13,7 @@ mod photo;
 mod ray;
 mod sheets;
 mod slope;
+mod square;
 mod sun;
 #[cfg(test)]
 mod tests;

@@ -23,7 +23,7 @@ pub(crate) use soils::{maximum, post};
 
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use crate::relief::{Relief, Soil};
-use profile::{Profile, Stretch};
+use profile::{Cuts, Profile, Stretch};
 use soils::Soils;
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
@@ -92,7 +92,9 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     cell: [L::I; 2],
     block: L::I,
     steps: Steps<L>,
-    profile: Profile<L>,
+    /// Height over the camera where the cell ends, and the vertices inside.
+    height: L::F,
+    cuts: Cuts<L>,
     stretch: Stretch<L>,
     fineness: Fineness,
     /// Lanes whose ray meets the stretch, and lanes with more vertices in their cell.
@@ -177,7 +179,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 ahead: zero,
                 passed: zero,
             },
-            profile: Profile::new(),
+            height: none,
+            cuts: Cuts::new(),
             stretch: Stretch::new(),
             fineness,
             ready: L::M::none(),
@@ -250,21 +253,27 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let mut ready = self.ready;
         self.steps.passed = L::I::select(ready, L::I::splat(0), self.steps.passed);
         let mut at = self.rows.at + self.row.times(pitch);
+        // The next ray of each lane, whether it has met this one or not: so none waits to
+        // learn that.
+        let mut next = self.row;
+        let (mut rise, mut across) = (self.rise, self.across);
         let mut done = L::M::none();
         while ready.any() {
-            let answer = self.stretch.contact(self.rise, self.across);
+            let answer = self.stretch.contact(rise, across);
             // Coarse cells may reach beyond the layer, where there is nothing to meet.
-            let inside = ready & (self.across * self.last).lt(answer);
+            let inside = ready & (across * self.last).lt(answer);
             let answer = if self.fineness.apart > 0.0 { soil.marked::<L>(answer) } else { answer };
             let answer = L::F::select(self.unsure, L::F::splat(f32::NAN), answer);
             answer.scatter(met, at, inside);
             at = at + pitch;
-            self.row = L::I::select(inside, self.row + one, self.row);
-            (self.rise, self.across) = self.rows.ray(self.row);
-            let more = inside & self.row.lt(count);
+            next = next + one;
+            self.row = L::I::select(inside, next, self.row);
+            (rise, across) = self.rows.ray(next);
+            let more = inside & next.lt(count);
             done = done | (ready & !more);
-            ready = more & self.stretch.is_met(self.rise, self.across);
+            ready = more & self.stretch.is_met(rise, across);
         }
+        (self.rise, self.across) = self.rows.ray(self.row);
         if done.any() {
             self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
             self.split = self.split & !done;
@@ -276,12 +285,10 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     #[inline(always)]
     fn go_on(&mut self) {
         let lanes = self.split;
-        let profile = &mut self.profile;
-        profile.t = L::F::select(lanes, profile.t + profile.step, profile.t);
-        let (s, height) = profile.vertex();
+        let (split, [s, height]) = self.cuts.go_on(lanes);
         self.stretch.reach(self.relief, s, height, lanes);
         self.ready = lanes & self.stretch.is_met(self.rise, self.across);
-        self.split = lanes & self.profile.is_cut();
+        self.split = split;
     }
 
     /// Finds the tiles of plots that lanes have come to. Returns the lanes that now seek in
@@ -415,8 +422,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         if self.fineness.apart > 0.0 {
             soil.expect_post::<L>(ahead, going);
         }
-        self.profile.low = L::F::select(going, self.profile.high, self.profile.low);
-        self.look(soil, s, going);
+        self.look(soil, s, self.height, going);
         tired
     }
 
@@ -471,8 +477,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             self.expect(soil, seeking & !found);
         }
         if found.any() {
-            let start = self.arrive(soil, found);
-            self.look(soil, start, found);
+            let (start, low) = self.arrive(soil, found);
+            self.look(soil, start, low, found);
         }
         found
     }
@@ -487,9 +493,10 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     }
 
     /// Readies lanes to walk from the cells that they have found. Returns where their lines
-    /// enter these: not where the ray is free from, or the answer would depend on that.
+    /// enter these, not where the ray is free from, or the answer would depend on that; and
+    /// the height there.
     #[inline(always)]
-    fn arrive(&mut self, soil: &Soils, lanes: L::M) -> L::F {
+    fn arrive(&mut self, soil: &Soils, lanes: L::M) -> (L::F, L::F) {
         let one = L::I::splat(1);
         let level = L::I::load(&soil.level);
         let shrink = L::F::load(&soil.shrink);
@@ -534,15 +541,14 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let value = L::F::select(from[0].eq(none), west, value);
         let value = L::F::select(from[0].eq(full), east, value);
         let value = soil.height::<L>(value);
-        self.profile.low = L::F::select(lanes, value, self.profile.low);
         self.stretch.begin(self.relief, start, value, lanes);
-        start
+        (start, value)
     }
 
-    /// Reads the ground of the cells that lanes have come to at `start`, but for its height
-    /// there, and takes them to their next vertices.
+    /// Reads the ground of the cells that lanes have come to at `start`, where its height is
+    /// `low`, and takes them to their next vertices.
     #[inline(always)]
-    fn look(&mut self, soil: &Soils, start: L::F, lanes: L::M) {
+    fn look(&mut self, soil: &Soils, start: L::F, low: L::F, lanes: L::M) {
         self.looked += u64::from(lanes.count());
         let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
         let shrink = L::F::load(&soil.shrink);
@@ -572,14 +578,12 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let length = (end - start) * shrink;
         let twist = ((ne - nw) - (se - sw)) * L::F::load(&soil.step);
         let curl = twist * (length * self.lines.rate[0]) * (length * self.lines.rate[1]);
-        let profile = &mut self.profile;
-        profile.start = L::F::select(lanes, start, profile.start);
-        profile.end = L::F::select(lanes, end, profile.end);
-        profile.high = L::F::select(lanes, high, profile.high);
-        profile.curl = L::F::select(lanes, curl, profile.curl);
+        self.height = L::F::select(lanes, high, self.height);
         let solid = solid & lanes;
-        self.split = profile.cut(self.relief, self.fineness.straight, lanes, solid);
-        let (s, height) = profile.vertex();
+        let cell = Profile { start, end, low, high, curl };
+        let straight = self.fineness.straight;
+        let (split, [s, height]) = self.cuts.begin(self.relief, straight, cell, solid);
+        self.split = split;
         self.stretch.reach(self.relief, s, height, lanes);
         self.ready = solid & self.stretch.is_met(self.rise, self.across);
     }

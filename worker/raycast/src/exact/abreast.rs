@@ -1,12 +1,12 @@
 //! Rays abreast: the walk of `exact`, a ray a lane.
 //!
 //! ```text
-//! for some hundred rays at a time
+//! for some hundred rays at a time, but for those whose beam meets nothing
 //!   direction, stretch, span, where the walk begins
 //!   in f32, down to planes over the ground (`glide`)
 //!   in f32, while it is seen that the ray clears its cell or block: go on (`approach`)
 //!   test the cells in which that has ended: nearly all meet the surface there
-//! walk, for the others, from these cells on
+//! walk, for the others, from behind these cells on
 //!   lanes that are done take the next rays of the list
 //!   if most lanes are at a block
 //!     those pass it or go one level down
@@ -52,8 +52,13 @@ use walk::Walk;
 const IDLE_SHARE: usize = 4;
 /// Steps from cell to cell before blocks are tried: approaches begin close to the ground,
 /// and a step that looks at both costs nearly twice as much.
-const CELLS_FIRST: u32 = 16;
-/// Rays that are aimed before the first of them goes on: few enough for the nearest cache.
+const CELLS_FIRST: u32 = 8;
+/// Steps after which an approach ends when few lanes of its vector are left: the walk packs
+/// them with others.
+const LONG: u32 = CELLS_FIRST + 10;
+/// One lane of so many, or fewer, are few.
+const FEW: usize = 5;
+/// Rays that are aimed before any of them is stepped: few enough for the nearest cache.
 const BATCH: usize = 256;
 
 /// What all rays have in common.
@@ -132,52 +137,55 @@ impl Kernel for Abreast<'_, '_> {
 }
 
 impl Abreast<'_, '_> {
-    /// Brings all rays to the first cell that they may hit, some at a time. What does not
-    /// hit there is left for the walk.
+    /// Brings rays to the first cell that they may hit, or close to it, some at a time. What
+    /// does not hit there is left for the walk. Those whose beam meets nothing have missed.
     #[inline(always)]
     fn begin<L: Lanes, const ROUND: bool>(&mut self) -> u64 {
         self.rest.count = 0;
         let count = self.rays.count;
         let mut steps = 0;
-        let mut fleet = Vec::with_capacity(BATCH / L::N);
+        let mut fleet: Vec<(usize, Approach<L>)> = Vec::with_capacity(BATCH / L::N);
         let mut under_way = [0; BATCH];
         let mut from = 0;
         while from < count {
             let to = count.min(from + BATCH);
             fleet.clear();
+            let mut left = 0;
             let mut at = from;
             while at < to {
-                fleet.push(self.aim_at::<L, ROUND>(at, lanes_up_to::<L>(to - at)));
+                let lanes = lanes_up_to::<L>(to - at);
+                let free = self.load::<L>(Part::Depth, at);
+                if (lanes & free.lt(L::D::splat(f64::INFINITY))).any() {
+                    let mut approach = self.aim_at::<L, ROUND>(at, lanes);
+                    approach.glide(&self.sight, self.tiles);
+                    under_way[left] = fleet.len();
+                    left += usize::from(approach.active.any());
+                    fleet.push((at, approach));
+                } else {
+                    L::I::splat(Verdict::Miss as i32).store(&mut self.rays.verdicts[at..]);
+                }
                 at += L::N;
-            }
-            for approach in &mut fleet {
-                approach.glide(&self.sight, self.tiles);
-            }
-            let mut left = fleet.len();
-            for (n, number) in under_way[..left].iter_mut().enumerate() {
-                *number = n;
             }
             let mut turn = 0;
             while left > 0 {
+                let few = if turn < LONG { 0 } else { L::N / FEW };
                 let mut kept = 0;
                 for n in 0..left {
                     let number = under_way[n];
-                    let approach: &mut Approach<L> = &mut fleet[number];
+                    let (_, approach) = &mut fleet[number];
                     steps += if turn < CELLS_FIRST {
                         approach.step_cells(self.tiles)
                     } else {
                         approach.step(&self.sight, self.tiles)
                     };
                     under_way[kept] = number;
-                    kept += usize::from(approach.active.any());
+                    kept += usize::from(approach.active.count() as usize > few);
                 }
                 left = kept;
                 turn += 1;
             }
-            let mut at = from;
-            for approach in &fleet {
-                self.touch_at::<L, ROUND>(at, approach.cell, lanes_up_to::<L>(to - at));
-                at += L::N;
+            for (at, approach) in &fleet {
+                self.touch_at::<L, ROUND>(*at, approach.cell, lanes_up_to::<L>(to - at));
             }
             from = to;
         }
@@ -303,7 +311,7 @@ impl Abreast<'_, '_> {
         }
         let u = begin.max(walk.entry(&sight));
         let near = lanes & u.lt(walk.last);
-        let (hits, _, hit_u, hit_z) = walk.contacts::<ROUND>(&sight, self.tiles, near);
+        let (hits, absent, hit_u, hit_z) = walk.contacts::<ROUND>(&sight, self.tiles, near);
         let left = lanes & !hits;
         self.store::<L>(Part::U, at, L::D::select(hits, hit_u, L::D::select(near, u, begin)));
         self.store::<L>(Part::Z, at, hit_z);
@@ -313,11 +321,12 @@ impl Abreast<'_, '_> {
         let verdicts = L::I::select(hits, L::I::splat(Verdict::Hit as i32), before);
         verdicts.store(&mut self.rays.verdicts[at..]);
         if left.any() {
-            self.leave::<L, ROUND>(at, walk, left, near);
+            self.leave::<L, ROUND>(at, walk, left, near, absent);
         }
     }
 
-    /// Leaves rays for the walk.
+    /// Leaves rays for the walk: behind the cells that were tested, where these were loaded
+    /// and the course goes on.
     #[inline(always)]
     fn leave<L: Lanes, const ROUND: bool>(
         &mut self,
@@ -325,20 +334,25 @@ impl Abreast<'_, '_> {
         mut walk: Walk<L>,
         left: L::M,
         near: L::M,
+        absent: L::M,
     ) {
         let sight = self.sight;
-        let u = self.load::<L>(Part::U, at);
+        walk.u = self.load::<L>(Part::U, at);
+        walk.z = walk.z::<ROUND>(&sight, walk.u);
+        let exits = walk.exits::<ROUND>(&sight);
         // A course that ends on the way goes on in another: from its start on.
         for axis in 0..2 {
-            let first = walk.cell_at(&sight, axis, u);
+            let first = walk.cell_at(&sight, axis, walk.u);
             walk.cell[axis] = L::I::select(near, walk.cell[axis], first);
         }
-        let z = walk.z::<ROUND>(&sight, u);
-        let z = L::D::select(left, z, self.load::<L>(Part::Z, at));
+        walk.active = left;
+        walk.pass::<ROUND>(&sight, &exits, left & near & !(absent | exits.ends));
+        let z = L::D::select(left, walk.z, self.load::<L>(Part::Z, at));
+        self.store::<L>(Part::U, at, walk.u);
         self.store::<L>(Part::Z, at, z);
         self.store::<L>(Part::CellX, at, L::D::from_ints(walk.cell[0]));
         self.store::<L>(Part::CellY, at, L::D::from_ints(walk.cell[1]));
-        let mut bits = left.bits();
+        let mut bits = walk.active.bits();
         while bits != 0 {
             self.rest.take(self.rays, at + bits.trailing_zeros() as usize);
             bits &= bits - 1;

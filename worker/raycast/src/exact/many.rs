@@ -178,7 +178,7 @@ impl<'a> Many<'a> {
         path(self.camera, self.ground, place, part(Part::Depth))
     }
 
-    /// The unit vector of a ray's direction at the camera.
+    /// The unit vector of a ray's direction at the camera, for a ray that met the surface.
     pub(crate) fn direction(&self, ray: usize) -> DVec3 {
         let part = |part| self.rays.part(part)[ray];
         DVec3::new(part(Part::DirectionX), part(Part::DirectionY), part(Part::DirectionZ))

@@ -131,11 +131,24 @@ fn every_width_finds_the_same_bits_as_the_slow_twin() {
                         let depth = contact.u * path.direction.dot(camera.forward);
                         let inverse = (1.0 / depth) as f32;
                         assert_eq!(many.inverse_depths(ray, 1), [inverse], "{}", what());
+                        assert_eq!(many.direction(ray), path.direction, "{}", what());
                         hits += 1;
                     } else {
+                        assert_eq!(many.inverse_depths(ray, 1), [0.0], "{}", what());
                         misses += 1;
                     }
-                    assert_eq!(many.direction(ray), path.direction, "{}", what());
+                }
+                // As after beams that meet nothing, where rays have hit before: whole vectors
+                // are left out, and some of the last one.
+                many.clear();
+                let (beyond, left) = places.split_at(dice.below(400) as usize);
+                beyond.iter().for_each(|&place| many.push(place, f64::INFINITY));
+                left.iter().take(20).for_each(|&place| many.push(place, 0.0));
+                many.cast();
+                for ray in 0..many.len() {
+                    let truth = truths[ray..].first().filter(|_| ray >= beyond.len());
+                    let is_hit = matches!(truth, Some(Outcome::Hit(_)));
+                    assert_eq!(many.is_hit(ray), Some(is_hit), "{} {width:?}", land.name);
                 }
             }
         }

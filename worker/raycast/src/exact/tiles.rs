@@ -260,12 +260,16 @@ impl<'a> Tiles<'a> {
             let here = self.alike::<L>(numbers, rest);
             match self.last.1 {
                 Soil::Codes(codes) => {
-                    let code = L::I::gather_pairs(codes.maxima, at, here & blocks);
-                    let code = code & L::I::splat(0xFFFF);
-                    let any = here & blocks & !code.eq(L::I::splat(0));
-                    let highest = rough_heights::<L>(&codes, code);
-                    rough.highest = L::F::select(any, highest, rough.highest);
-                    rough.read_codes(&codes, corner, here & cells);
+                    if (here & blocks).any() {
+                        let code = L::I::gather_pairs(codes.maxima, at, here & blocks);
+                        let code = code & L::I::splat(0xFFFF);
+                        let any = here & blocks & !code.eq(L::I::splat(0));
+                        let highest = rough_heights::<L>(&codes, code);
+                        rough.highest = L::F::select(any, highest, rough.highest);
+                    }
+                    if (here & cells).any() {
+                        rough.read_codes(&codes, corner, here & cells);
+                    }
                 }
                 Soil::Floats { posts, maxima } => {
                     let read = L::F::from_bits(L::I::gather(maxima, at, here & blocks));

@@ -7,7 +7,7 @@
 
 mod doubles;
 
-use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask};
+use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask, check_rows};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -303,19 +303,20 @@ impl Ints for I {
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
-    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
-        let rest = table.len().min(i32::MAX as usize).checked_sub(3 * stride + 4);
-        let last = rest.expect("a table has four rows") as i32;
-        // SAFETY: see the page of this module; element `last + 3 * stride + 3` is inside the
+    fn gather_around(table: &[u16], at: I, stride: usize, mask: M) -> [I; 6] {
+        check_rows(table, stride);
+        let last = (table.len().min(i32::MAX as usize) - (3 * stride + 5)) as i32;
+        let factors = (stride << 16 | 1) as i32;
+        // SAFETY: see the page of this module; element `last + 3 * stride + 4` is inside the
         // table.
         unsafe {
+            let at = I(_mm256_madd_epi16(at.0, _mm256_set1_epi32(factors)));
             let first = table.as_ptr();
-            [
-                gather_eights::<2>(first.cast(), at, last, mask),
-                gather_eights::<2>(first.add(stride).cast(), at, last, mask),
-                gather_eights::<2>(first.add(2 * stride).cast(), at, last, mask),
-                gather_eights::<2>(first.add(3 * stride).cast(), at, last, mask),
-            ]
+            let (south, _) = gather_eights::<2>(first.add(1).cast(), at, last, mask);
+            let (a01, a23) = gather_eights::<2>(first.add(stride).cast(), at, last, mask);
+            let (b01, b23) = gather_eights::<2>(first.add(2 * stride).cast(), at, last, mask);
+            let (north, _) = gather_eights::<2>(first.add(3 * stride + 1).cast(), at, last, mask);
+            [south, a01, a23, b01, b23, north]
         }
     }
 }

@@ -3,8 +3,9 @@
 //! SAFETY of every block: as in `avx2`, with the features that [`run`] names.
 
 mod doubles;
+mod square;
 
-use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask};
+use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask, check_rows};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -286,21 +287,33 @@ impl Ints for I {
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
-    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
-        let rest = table.len().min(i32::MAX as usize).checked_sub(3 * stride + 4);
-        let last = rest.expect("a table has four rows") as i32;
-        // SAFETY: see the page of this module; element `last + 3 * stride + 3` is inside the
+    fn gather_around(table: &[u16], at: I, stride: usize, mask: M) -> [I; 6] {
+        check_rows(table, stride);
+        let last = (table.len().min(i32::MAX as usize) - (3 * stride + 5)) as i32;
+        // SAFETY: see the page of this module; element `last + 3 * stride + 4` is inside the
         // table.
         unsafe {
+            let at = I(_mm512_madd_epi16(at.0, _mm512_set1_epi32((stride << 16 | 1) as i32)));
             let places = places(at, last);
-            let first: *const u8 = table.as_ptr().cast();
-            [
-                eights::<2>(first, &places, mask),
-                eights::<2>(first.add(2 * stride), &places, mask),
-                eights::<2>(first.add(4 * stride), &places, mask),
-                eights::<2>(first.add(6 * stride), &places, mask),
-            ]
+            let first = table.as_ptr();
+            let (south, _) = eights::<2>(first.add(1).cast(), &places, mask);
+            let (a01, a23) = eights::<2>(first.add(stride).cast(), &places, mask);
+            let (b01, b23) = eights::<2>(first.add(2 * stride).cast(), &places, mask);
+            let (north, _) = eights::<2>(first.add(3 * stride + 1).cast(), &places, mask);
+            [south, a01, a23, b01, b23, north]
         }
+    }
+
+    #[inline(always)]
+    fn corner(low: I, high: I, limit: i32, mask: M) -> (i32, bool) {
+        // SAFETY: see the page of this module.
+        unsafe { square::corner(low, high, limit, mask) }
+    }
+    #[inline(always)]
+    fn around_in(table: &[u16], first: usize, stride: usize, at: I) -> [I; 6] {
+        assert!(first + 7 * stride + 8 <= table.len(), "the square is in the table");
+        // SAFETY: see the page of this module.
+        unsafe { square::around(table.as_ptr().add(first), stride, at) }
     }
 }
 

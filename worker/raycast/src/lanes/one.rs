@@ -2,7 +2,7 @@
 
 mod doubles;
 
-use super::{Floats, Ints, Lanes, MOST, Mask};
+use super::{Floats, Ints, Lanes, MOST, Mask, check_rows};
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
 #[derive(Clone, Copy)]
@@ -243,16 +243,13 @@ impl Ints for I {
         (I(table[at] as i32), I(table[at + 1] as i32))
     }
     #[inline(always)]
-    fn gather_rows(table: &[u16], at: I, stride: usize, mask: M) -> [(I, I); 4] {
-        let last = table.len().checked_sub(3 * stride + 4).expect("a table has four rows");
-        let at = (at.0 as u32 as usize).min(last);
-        let mut rows = [(I(0), I(0)); 4];
-        for (number, row) in rows.iter_mut().enumerate() {
-            let at = (at + number * stride) as i32;
-            let east = Self::gather_pairs(table, I(at + 2), mask);
-            *row = (Self::gather_pairs(table, I(at), mask), east);
-        }
-        rows
+    fn gather_around(table: &[u16], at: I, stride: usize, mask: M) -> [I; 6] {
+        check_rows(table, stride);
+        let at = (at.0 & 0xFFFF) + (at.0 >> 16) * stride as i32;
+        let pair = |row: usize, column: i32| {
+            Self::gather_pairs(table, I(at + (row * stride) as i32 + column), mask)
+        };
+        [pair(0, 1), pair(1, 0), pair(1, 2), pair(2, 0), pair(2, 2), pair(3, 1)]
     }
 }
 

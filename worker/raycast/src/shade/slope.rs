@@ -9,6 +9,7 @@
 use super::batch::{Each, VECTORS};
 use super::level::{Between, first, shrink};
 use super::sheets::{Sheet, Sheets, Soil, Spot, TILE_BITS};
+use super::square::{Square, first_of};
 use crate::field::Wanted;
 use crate::lanes::as_bits;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
@@ -35,6 +36,8 @@ pub(crate) struct Cells {
     number: Each<i32>,
     post: Each<i32>,
     place: [Each<f32>; 2],
+    /// The square that has the posts around all of them, if there is one.
+    square: [Square; VECTORS],
 }
 
 impl Cells {
@@ -50,6 +53,7 @@ impl Cells {
             number: zero,
             post: zero,
             place: [none; 2],
+            square: [Square::NONE; VECTORS],
         }
     }
 
@@ -131,8 +135,11 @@ impl Cells {
         let spot = spot.at_level(level);
         let (tx, i) = Sheet::tile_of::<L>(last[0], spot.cell[0]);
         let (ty, j) = Sheet::tile_of::<L>(last[1], spot.cell[1]);
-        (ty.times(last[0] + L::I::splat(1)) + tx).store(&mut self.number[at..]);
+        let number = ty.times(last[0] + L::I::splat(1)) + tx;
+        number.store(&mut self.number[at..]);
         let (post, [x, y]) = post::<L>([i, j], spot.part);
+        let around = L::I::splat(3 << 16 | 3);
+        self.square[n] = Square::of::<L>([level, number], [post, post + around], wanted);
         post.store(&mut self.post[at..]);
         x.store(&mut self.place[0][at..]);
         y.store(&mut self.place[1][at..]);
@@ -165,8 +172,8 @@ impl Cells {
         let [x, y] = &*slopes;
         let mut found = [L::F::load(&x[at..]), L::F::load(&y[at..])];
         while left.any() {
-            let (known_level, known) = (first::<L>(level, left), first::<L>(number, left));
-            let here = left & level.eq(L::I::splat(known_level)) & number.eq(L::I::splat(known));
+            let square = self.square[n];
+            let ([known_level, known], here) = square.next::<L>([level, number], left);
             left = left & !here;
             let tile = match sheets.tile(known_level, known, missing) {
                 Soil::Tile(tile) => tile,
@@ -176,7 +183,7 @@ impl Cells {
                     continue;
                 }
             };
-            let (known, rise) = rises::<L>(tile, post, place, here);
+            let (known, rise) = rises::<L>(tile, post, place, here, square.corner);
             let scale = shrink::<L>(L::I::splat(known_level));
             for axis in 0..2 {
                 let slope = rise[axis] * (scale * L::F::splat(sheets.rate[axis]));
@@ -190,8 +197,8 @@ impl Cells {
     }
 }
 
-/// The post to the south-west of a cell's own, of which there is a ring, and the place in
-/// the cell.
+/// The post to the south-west of a cell's own, of which there is a ring: column, and from bit
+/// 16 on the row. And the place in the cell.
 #[inline(always)]
 fn post<L: Lanes>(cell: [L::I; 2], part: [L::F; 2]) -> (L::I, [L::F; 2]) {
     // The last tile's last post is the end of a cell, too.
@@ -199,20 +206,29 @@ fn post<L: Lanes>(cell: [L::I; 2], part: [L::F; 2]) -> (L::I, [L::F; 2]) {
     let (i, j) = (cell[0].min(most), cell[1].min(most));
     let x = part[0] + (cell[0] - i).to_floats();
     let y = part[1] + (cell[1] - j).to_floats();
-    (j.times(L::I::splat(TILE_POSTS as i32)) + i, [x, y])
+    (j.shl(L::I::splat(16)) + i, [x, y])
 }
 
-/// Rise a cell along x and y, and whether any post around knows of one.
+/// Rise a cell along x and y, and whether any post around knows of one. If there is a corner,
+/// its square has all posts around the lanes' cells.
 #[inline(always)]
 fn rises<L: Lanes>(
     tile: &HeightTile,
     at: L::I,
     [x, y]: [L::F; 2],
     lanes: L::M,
+    corner: Option<i32>,
 ) -> (L::M, [L::F; 2]) {
     match tile.heights() {
         Heights::Codes(codes) if !tile.has_voids() => {
-            let [dx, dy] = whole_codes::<L>(&codes, at, [x, y], lanes);
+            let around = match corner {
+                Some(corner) => {
+                    let from = at - L::I::splat(corner);
+                    L::I::around_in(codes.posts, first_of(corner), TILE_POSTS, from)
+                }
+                None => L::I::gather_around(codes.posts, at, TILE_POSTS, lanes),
+            };
+            let [dx, dy] = whole_codes::<L>(around, [x, y]);
             let half = L::F::splat((0.5 * codes.step) as f32);
             (!L::M::none(), [dx * half, dy * half])
         }
@@ -221,18 +237,17 @@ fn rises<L: Lanes>(
     }
 }
 
-/// Twice the rise a cell where no post is void, in steps of the codes.
+/// Twice the rise a cell where no post is void, in steps of the codes, from the codes around.
 #[inline(always)]
-fn whole_codes<L: Lanes>(codes: &Codes, at: L::I, [x, y]: [L::F; 2], lanes: L::M) -> [L::F; 2] {
+fn whole_codes<L: Lanes>(around: [L::I; 6], [x, y]: [L::F; 2]) -> [L::F; 2] {
     let (low, sixteen) = (L::I::splat(0xFFFF), L::I::splat(16));
-    let rows = L::I::gather_rows(codes.posts, at, TILE_POSTS, lanes);
-    let [(z01, z23), (a01, a23), (b01, b23), (y01, y23)] = rows;
+    let [z12, a01, a23, b01, b23, y12] = around;
     let (a0, a1) = (a01 & low, a01.shr(sixteen) & low);
     let (a2, a3) = (a23 & low, a23.shr(sixteen) & low);
     let (b0, b1) = (b01 & low, b01.shr(sixteen) & low);
     let (b2, b3) = (b23 & low, b23.shr(sixteen) & low);
-    let (z1, z2) = (z01.shr(sixteen) & low, z23 & low);
-    let (y1, y2) = (y01.shr(sixteen) & low, y23 & low);
+    let (z1, z2) = (z12 & low, z12.shr(sixteen) & low);
+    let (y1, y2) = (y12 & low, y12.shr(sixteen) & low);
     let south = lerp::<L>((a2 - a0).to_floats(), (a3 - a1).to_floats(), x);
     let north = lerp::<L>((b2 - b0).to_floats(), (b3 - b1).to_floats(), x);
     let west = lerp::<L>((b1 - z1).to_floats(), (y1 - a1).to_floats(), y);
@@ -246,23 +261,21 @@ type Posts<L> = [<L as Lanes>::F; 12];
 
 #[inline(always)]
 fn coded<L: Lanes>(codes: &Codes, at: L::I, lanes: L::M) -> Posts<L> {
-    let rows = L::I::gather_rows(codes.posts, at, TILE_POSTS, lanes);
-    let rows =
-        [rows[0].0, rows[0].1, rows[1].0, rows[1].1, rows[2].0, rows[2].1, rows[3].0, rows[3].1];
+    let [z12, a01, a23, b01, b23, y12] = L::I::gather_around(codes.posts, at, TILE_POSTS, lanes);
     let step = codes.step as f32;
     [
-        height::<L>(rows[0], true, step),
-        height::<L>(rows[1], false, step),
-        height::<L>(rows[2], false, step),
-        height::<L>(rows[2], true, step),
-        height::<L>(rows[3], false, step),
-        height::<L>(rows[3], true, step),
-        height::<L>(rows[4], false, step),
-        height::<L>(rows[4], true, step),
-        height::<L>(rows[5], false, step),
-        height::<L>(rows[5], true, step),
-        height::<L>(rows[6], true, step),
-        height::<L>(rows[7], false, step),
+        height::<L>(z12, false, step),
+        height::<L>(z12, true, step),
+        height::<L>(a01, false, step),
+        height::<L>(a01, true, step),
+        height::<L>(a23, false, step),
+        height::<L>(a23, true, step),
+        height::<L>(b01, false, step),
+        height::<L>(b01, true, step),
+        height::<L>(b23, false, step),
+        height::<L>(b23, true, step),
+        height::<L>(y12, false, step),
+        height::<L>(y12, true, step),
     ]
 }
 
@@ -277,6 +290,7 @@ fn height<L: Lanes>(pair: L::I, upper: bool, step: f32) -> L::F {
 #[inline(always)]
 fn plain<L: Lanes>(floats: &Floats32, at: L::I, lanes: L::M) -> Posts<L> {
     let width = L::I::splat(TILE_POSTS as i32);
+    let at = at.shr(L::I::splat(16)).times(width) + (at & L::I::splat(0xFFFF));
     let two = L::I::splat(2);
     let posts = as_bits(floats.posts);
     let (south, middle, north) = (at + width, at + width + width, at + width + width + width);
@@ -344,17 +358,98 @@ pub(crate) fn lerp<L: Lanes>(a: L::F, b: L::F, t: L::F) -> L::F {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lanes::One;
+    use crate::lanes::{self, Kernel, MOST, One, Width};
+    use proptest::prelude::*;
 
     /// Rises in a cell of a tile; `None` if no post knows of any.
     fn at(tile: &HeightTile, cell: [i32; 2], part: [f32; 2]) -> Option<[f32; 2]> {
         let lanes = <One as Lanes>::M::from_bits(1);
         let (post, place) = post::<One>(cell.map(Ints::splat), part.map(Floats::splat));
-        let (known, rise) = rises::<One>(tile, post, place, lanes);
+        let (known, rise) = rises::<One>(tile, post, place, lanes, None);
         let mut found = [[0.0f32; 1]; 2];
         rise[0].store(&mut found[0]);
         rise[1].store(&mut found[1]);
         known.any().then_some([found[0][0], found[1][0]])
+    }
+
+    /// Slopes at cells that are close together, out of a square and lane by lane.
+    struct Squares<'t> {
+        tile: &'t HeightTile,
+        /// The first cell, and how far the others are from it at most.
+        from: [i32; 2],
+        reach: i32,
+        seed: u32,
+    }
+
+    impl Kernel for Squares<'_> {
+        /// Whether there was a square.
+        type Output = bool;
+
+        #[inline(always)]
+        fn run<L: Lanes>(self) -> bool {
+            let mut random = self.seed;
+            let mut next = |most: i32| {
+                random = random.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+                (random >> 16) as i32 % (most + 1)
+            };
+            let (mut cells, mut parts) = ([[0; MOST]; 2], [[0.0; MOST]; 2]);
+            for lane in 0..MOST {
+                for axis in 0..2 {
+                    let cell = self.from[axis] + next(self.reach);
+                    cells[axis][lane] = cell.min(1 << TILE_BITS);
+                    let end = cell >= 1 << TILE_BITS;
+                    parts[axis][lane] = if end { 0.0 } else { next(999) as f32 * 1e-3 };
+                }
+            }
+            let lanes = L::M::from_bits((1 + next(0xFFFE) as u32) & ((1 << L::N) - 1) | 1);
+            let cell = [L::I::load(&cells[0]), L::I::load(&cells[1])];
+            let part = [L::F::load(&parts[0]), L::F::load(&parts[1])];
+            let (post, place) = post::<L>(cell, part);
+            let zero = L::I::splat(0);
+            let end = post + L::I::splat(3 << 16 | 3);
+            let square = Square::of::<L>([zero, zero], [post, end], lanes);
+            let (known, rise) = rises::<L>(self.tile, post, place, lanes, square.corner);
+            let mut found = [[0.0f32; MOST]; 2];
+            rise[0].store(&mut found[0]);
+            rise[1].store(&mut found[1]);
+            for lane in (0..L::N).filter(|lane| lanes.bits() >> lane & 1 == 1) {
+                let cell = [cells[0][lane], cells[1][lane]];
+                let alone = at(self.tile, cell, [parts[0][lane], parts[1][lane]]);
+                assert_eq!(alone.is_some(), known.bits() >> lane & 1 == 1);
+                if let Some(alone) = alone {
+                    let found = [found[0][lane], found[1][lane]];
+                    assert_eq!(found.map(f32::to_bits), alone.map(f32::to_bits), "{cell:?}");
+                }
+            }
+            square.corner.is_some()
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_square_of_posts_gives_the_slopes_of_each_place_alone(
+            x in 0..=256,
+            y in 0..=256,
+            edges in 0..4,
+            reach in 0..10,
+            holes in 0u32..3,
+            seed: u32,
+        ) {
+            let from = [if edges & 1 == 1 { 252 } else { x }, if edges & 2 == 2 { 252 } else { y }];
+            let noise = |x: f32, y: f32| {
+                ((x as i32 as u32).wrapping_mul(7919) ^ (y as i32 as u32).wrapping_mul(104_729))
+                    .wrapping_add(seed).wrapping_mul(2_654_435_761) >> 16
+            };
+            let tile = tile(|x, y| match noise(x, y) {
+                n if n % 64 < holes => f32::NAN,
+                n => (n % 65_000) as f32,
+            });
+            for width in Width::available() {
+                let squares = lanes::run(Squares { tile: &tile, from, reach, seed }, width);
+                prop_assert!(!squares || width == Width::Sixteen);
+                prop_assert!(squares || width != Width::Sixteen || reach > 4);
+            }
+        }
     }
 
     fn tile(height: impl Fn(f32, f32) -> f32) -> HeightTile {

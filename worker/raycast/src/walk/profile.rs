@@ -31,9 +31,15 @@ pub(super) struct Profile<L: Lanes> {
     /// How much the ground bends in between: t of the way it is `t (1 - t) curl` below the
     /// straight line.
     pub curl: L::F,
+}
+
+/// Cells with vertices inside.
+#[derive(Clone, Copy)]
+pub(super) struct Cuts<L: Lanes> {
+    profile: Profile<L>,
     /// How far through the cell the last vertex is, 0 to 1, and how much further the next.
-    pub t: L::F,
-    pub step: L::F,
+    t: L::F,
+    step: L::F,
 }
 
 /// The ground between the last two vertices.
@@ -51,49 +57,79 @@ pub(super) struct Stretch<L: Lanes> {
     limit: L::F,
 }
 
-impl<L: Lanes> Profile<L> {
+impl<L: Lanes> Cuts<L> {
     pub fn new() -> Self {
         let (zero, one) = (L::F::splat(0.0), L::F::splat(1.0));
-        Profile { start: zero, end: zero, low: zero, high: zero, curl: zero, t: one, step: one }
+        let profile = Profile { start: zero, end: zero, low: zero, high: zero, curl: zero };
+        Cuts { profile, t: one, step: one }
     }
 
-    /// Sets out for the first vertex behind the start of a cell. With more than `allowed`
-    /// metres a metre away between ground and stretches there will be more of these, if
-    /// there is ground. Returns the lanes with more than one.
+    /// Sets out through cells, as far as there is ground: those in which more than `allowed`
+    /// metres a metre away would be between it and a straight line have vertices inside.
+    /// Returns the lanes that have more than one left, and the next vertices of all, by
+    /// distance and height.
     #[inline(always)]
-    pub fn cut(&mut self, relief: &Relief, allowed: f32, lanes: L::M, solid: L::M) -> L::M {
-        let one = L::F::splat(1.0);
-        let length = self.end - self.start;
+    pub fn begin(
+        &mut self,
+        relief: &Relief,
+        allowed: f32,
+        profile: Profile<L>,
+        solid: L::M,
+    ) -> (L::M, [L::F; 2]) {
+        let Profile { start, end, high, curl, .. } = profile;
+        let length = end - start;
         let arc = L::F::splat(0.5 * relief.curvature as f32) * length * length;
-        let off = (self.curl - arc).abs() * L::F::splat(0.25);
-        let allowed = L::F::splat(allowed) * self.start;
+        let off = (curl - arc).abs() * L::F::splat(0.25);
+        let allowed = L::F::splat(allowed) * start;
         let many = solid & allowed.lt(off);
-        (self.t, self.step) =
-            (L::F::select(lanes, one, self.t), L::F::select(lanes, one, self.step));
-        if many.any() {
-            let count = off.div(allowed.max(L::F::splat(NO_DISTANCE))).sqrt();
-            let count = count.min(L::F::splat(MOST_STRETCHES - 1.0)).floor() + L::I::splat(1);
-            let step = one.div(count.to_floats());
-            self.step = L::F::select(many, step, self.step);
-            self.t = L::F::select(many, step, self.t);
+        if !many.any() {
+            return (many, [end, high]);
         }
-        many
+        let count = off.div(allowed.max(L::F::splat(NO_DISTANCE))).sqrt();
+        let count = count.min(L::F::splat(MOST_STRETCHES - 1.0)).floor() + L::I::splat(1);
+        let step = L::F::splat(1.0).div(count.to_floats());
+        self.profile = Profile::select(many, profile, self.profile);
+        self.step = L::F::select(many, step, self.step);
+        self.t = L::F::select(many, step, self.t);
+        let inside = many & self.is_within();
+        let [s, height] = self.vertex();
+        (inside, [L::F::select(many, s, end), L::F::select(many, height, high)])
     }
 
-    /// Whether there are more vertices in the cell.
+    /// Goes on to the next vertices of lanes. Returns the same.
     #[inline(always)]
-    pub fn is_cut(&self) -> L::M {
+    pub fn go_on(&mut self, lanes: L::M) -> (L::M, [L::F; 2]) {
+        self.t = L::F::select(lanes, self.t + self.step, self.t);
+        (lanes & self.is_within(), self.vertex())
+    }
+
+    /// Whether the vertex is inside the cell.
+    #[inline(always)]
+    fn is_within(&self) -> L::M {
         (L::F::splat(0.5) * self.step).le(L::F::splat(1.0) - self.t)
     }
 
-    /// Distance and height of the vertex at t.
+    /// Distance and height of the vertex.
     #[inline(always)]
-    pub fn vertex(&self) -> (L::F, L::F) {
-        let one = L::F::splat(1.0);
-        let more = self.is_cut();
-        let s = self.start + self.t * (self.end - self.start);
-        let height = self.low + self.t * ((self.high - self.low) - self.curl * (one - self.t));
-        (L::F::select(more, s, self.end), L::F::select(more, height, self.high))
+    fn vertex(&self) -> [L::F; 2] {
+        let Profile { start, end, low, high, curl } = self.profile;
+        let within = self.is_within();
+        let s = start + self.t * (end - start);
+        let height = low + self.t * ((high - low) - curl * (L::F::splat(1.0) - self.t));
+        [L::F::select(within, s, end), L::F::select(within, height, high)]
+    }
+}
+
+impl<L: Lanes> Profile<L> {
+    #[inline(always)]
+    fn select(lanes: L::M, yes: Self, no: Self) -> Self {
+        Profile {
+            start: L::F::select(lanes, yes.start, no.start),
+            end: L::F::select(lanes, yes.end, no.end),
+            low: L::F::select(lanes, yes.low, no.low),
+            high: L::F::select(lanes, yes.high, no.high),
+            curl: L::F::select(lanes, yes.curl, no.curl),
+        }
     }
 }
 

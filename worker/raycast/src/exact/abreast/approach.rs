@@ -1,7 +1,7 @@
 //! The way of rays up to where f64 must tell: over cells and blocks, in f32.
 //!
-//! It decides nothing: an approach ends in the first cell that the ray is not seen to
-//! clear, and what is done in f64 begins there.
+//! It decides nothing: an approach ends at the latest in the first cell that the ray is not
+//! seen to clear, and what is done in f64 begins there.
 //!
 //! **What is to be shown.** The approach leaves cells behind. The rest may begin where the
 //! ray enters the last cell, if the ray goes through just these cells, in the twin's order,
@@ -48,8 +48,8 @@
 
 use super::walk::cell_at;
 use super::{Sight, Start};
-use crate::exact::CLEARANCE_M;
 use crate::exact::tiles::{Rough, Tiles};
+use crate::exact::{CLEARANCE_M, FIRST_LEVEL};
 use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
@@ -73,6 +73,7 @@ pub(super) struct Approach<L: Lanes> {
     pub(super) cell: [L::I; 2],
     /// The same from `base` on.
     pub(super) place: [L::F; 2],
+    /// Of the block that is looked at, once blocks are.
     level: L::I,
     /// How far the ray has come.
     pub(super) v: L::F,
@@ -132,7 +133,7 @@ impl<L: Lanes> Approach<L> {
             base: [zero; 2],
             cell: [zero; 2],
             place: [none; 2],
-            level: zero,
+            level: L::I::splat(FIRST_LEVEL as i32),
             v: none,
             gap: none,
             fresh: active,
@@ -235,8 +236,11 @@ impl<L: Lanes> Approach<L> {
             .exits([(lines[0] - self.base[0]).to_floats(), (lines[1] - self.base[1]).to_floats()]);
         let rough = tiles.rough::<L>(self.cell, self.level, blocks, cells);
         let passed = rough.highest.lt(self.low(self.v).min(exits.low));
-        let missed = self.misses(&rough, &exits, cells) | !rough.solid;
-        let clear = ((blocks & passed) | (cells & missed)) & !rough.absent;
+        let mut clear = blocks & passed & !rough.absent;
+        if cells.any() {
+            let missed = self.misses(&rough, &exits, cells) | !rough.solid;
+            clear = clear | (cells & missed & !rough.absent);
+        }
         let down = blocks & !clear & !rough.absent;
         self.level = L::I::select(down, self.level - one, self.level);
         let before = self.cell;
