@@ -117,8 +117,10 @@ impl Browser {
         }
     }
 
-    /// Clicks with the mouse in the middle of an element.
+    /// Clicks with the mouse in the middle of an element. Before the page is painted its style
+    /// sheet may still be on the way, and the element moves once that is there.
     fn click(&mut self, element: &str) {
+        self.expect("performance.getEntriesByName('first-contentful-paint').length");
         let place = self.ask(&format!(
             "(() => {{ const e = {element}; e.scrollIntoView({{block: 'center'}}); \
              const r = e.getBoundingClientRect(); \
