@@ -6,8 +6,8 @@
 //! columns are those of a camera that does not roll). `lattice` says which lines and rays
 //! there are: neighbours are six pixels apart for each pixel of tolerance, but at most four.
 //!
-//! What rays find is kept as inverse depth, which over a plane is linear in the picture.
-//! There is a ray in each row for each line, so a pixel lies between two rays. Where the
+//! What rays find is kept as inverse depth, which over a plane is linear in the picture: the
+//! rays of a line that see the same plane are answered together (`planes`). There is a ray in each row for each line, so a pixel lies between two rays. Where the
 //! rays around these bend no more than the tolerance allows, and the posts of the ground
 //! are further apart than lines, the pixel is between the two (`net`). Where they bend more
 //! it is compared with the surface at that very place, and moved along its own ray until it
@@ -19,6 +19,7 @@
 
 mod doubts;
 mod net;
+mod planes;
 mod turned;
 
 use crate::lanes::{Floats, Ints, Kernel, Lanes, MOST, Mask, as_bits};
@@ -31,6 +32,7 @@ use doubts::{Doubts, GUESSES, SKY};
 use glam::DVec2;
 use net::{BEHIND, BENT, BROKEN, Bends, Net, OPEN, Rules, Verdict};
 pub(crate) use net::{TOLD, WHOLE};
+use planes::Planes;
 use std::cell::Cell;
 use std::ops::Range;
 use terrafarm_common::camera::Camera;
@@ -81,6 +83,7 @@ pub(crate) struct Columns<'r, 'a> {
 /// memory would cost a tenth of the time.
 #[derive(Default)]
 struct Room {
+    planes: Planes,
     net: Net,
     verdict: Verdict,
     turned: Turned,
@@ -102,7 +105,8 @@ impl Room {
     fn give_back(mut self: Box<Room>) {
         self.alone.clear();
         let own = self.alone.capacity() * size_of::<Alone>();
-        if self.net.bytes() + self.doubts.bytes() + self.rest.bytes() + own <= KEPT_BYTES {
+        let lists = self.planes.bytes() + self.doubts.bytes() + self.rest.bytes();
+        if self.net.bytes() + lists + own <= KEPT_BYTES {
             ROOM.set(Some(self));
         }
     }
@@ -122,7 +126,7 @@ impl Kernel for Columns<'_, '_> {
         let area = self.region.area() as usize;
         let mut seen = Seen::sky(self.region);
         let mut room = Room::take();
-        let Room { net, verdict, turned, doubts, rest, alone } = &mut *room;
+        let Room { planes, net, verdict, turned, doubts, rest, alone } = &mut *room;
         let spacing = (SPACING * self.tolerance_px).clamp(SPACINGS[0], SPACINGS[1]);
         let mut done = 0;
         for by_rows in [true, false] {
@@ -132,7 +136,8 @@ impl Kernel for Columns<'_, '_> {
                 for part in parts(self.region, by_rows) {
                     let Some(spans) = spans(&frame, &band, &fan, &part) else { continue };
                     let first = band.rows.start.max(part[1].start);
-                    let rules = self.cast::<L>(&frame, &fan, first, &spans, net, &mut seen);
+                    let rules =
+                        self.cast::<L>(&frame, &fan, first, &spans, (planes, net), &mut seen);
                     let depths = &mut seen.inverse_depth;
                     let filled = spans.iter().zip(first..);
                     for (span, row) in filled.filter(|(span, _)| !span.pixels.is_empty()) {
@@ -235,7 +240,7 @@ impl Columns<'_, '_> {
         fan: &Fan,
         first_row: u32,
         spans: &[Span],
-        net: &mut Net,
+        (planes, net): (&mut Planes, &mut Net),
         seen: &mut Seen,
     ) -> Rules {
         // One more on each side to compare with, and what may come up from below.
@@ -261,7 +266,7 @@ impl Columns<'_, '_> {
             };
             if let Some(rays) = rays_of(&meets) {
                 seen.rays += rays.len() as u64 * L::N as u64;
-                seen.steps += self.block::<L>(frame, fan, block, rays, net);
+                seen.steps += self.block::<L>(frame, fan, block, rays, (planes, net));
             }
         }
         let bends = BENDS * self.tolerance_px;
@@ -290,7 +295,7 @@ impl Columns<'_, '_> {
         fan: &Fan,
         first: i32,
         rays: Range<i32>,
-        net: &mut Net,
+        (planes, net): (&mut Planes, &mut Net),
     ) -> u64 {
         let mut values = [[0.0f32; MOST]; 6];
         for lane in 0..L::N {
@@ -313,33 +318,27 @@ impl Columns<'_, '_> {
             (rise + d(ray) * higher) / (length + d(ray) * longer)
         };
         let (low, high) = (rays.start, rays.end - 1);
-        let onwards = tangent(low) <= tangent(high);
-        let (begin, step) = if onwards { (low, 1) } else { (high, -1) };
-        let at = net.place(begin, first);
-        let mut places = [0; MOST];
-        for (place, lane) in places.iter_mut().zip(0..) {
-            *place = at + lane;
-        }
-        let (x, y) = (L::F::load(&values[0]), L::F::load(&values[1]));
-        let rows = Rows {
-            length: L::F::load(&values[2]),
-            longer: L::F::load(&values[3]),
-            rise: L::F::load(&values[4]),
-            higher: L::F::load(&values[5]),
-            first: d(begin),
-            step: (fan.towards * step) as f32,
-            count: high - low + 1,
-            at: L::I::load(&places),
-            pitch: net.width as i32 * step,
-        };
+        let step = if tangent(low) <= tangent(high) { 1 } else { -1 };
+        let (from, to) = if step == 1 { (low, high) } else { (-high, -low) };
+        let onwards = L::F::splat((fan.towards * step) as f32);
+        let [x, y, length, longer, rise, higher] = &values;
+        let [x, y] = [L::F::load(x), L::F::load(y)];
+        let rise = [L::F::load(rise), L::F::load(higher) * onwards];
+        let length = [L::F::load(length), L::F::load(longer) * onwards];
+        let rows = Rows::new(rise, length, from, to);
+        planes.clear::<L>(rays.len());
         let lines = Lines::<L>::new(self.relief, [x, y]);
         let focal = self.camera.focal_px();
         let fineness = Fineness {
             straight: (STRAIGHT * self.tolerance_px / focal) as f32,
             apart: (fan.spacing / focal) as f32,
         };
-        let mut walk = Walk::new(self.relief, lines, rows, L::F::splat(0.0), FIRST_BLOCK, fineness);
-        walk.run(&mut net.answers);
+        let free = L::F::splat(0.0);
+        let mut walk =
+            Walk::new(self.relief, lines, rows, planes.places::<L>(), free, FIRST_BLOCK, fineness);
+        walk.run(planes.found());
+        let at = net.place(from * step, first) as usize;
+        planes.fill::<L>(from, &mut net.answers, at, net.width as isize * step as isize);
         walk.looked
     }
 

@@ -9,7 +9,7 @@ use crate::painter::squares;
 use crate::path::Ground;
 use crate::relief::Relief;
 use crate::seen::Seen;
-use crate::walk::{Fineness, Lines, Rows, Walk};
+use crate::walk::{Fineness, Lines, Places, Rows, Walk};
 use glam::DVec3;
 use terrafarm_common::camera::Camera;
 use terrafarm_common::region::Region;
@@ -76,6 +76,10 @@ impl Kernel for Lod<'_, '_> {
     }
 }
 
+/// How much more the next ray of a line would rise, for a depth of 1: so little that ground
+/// never counts as equally far.
+const NEXT_RAY: f32 = 1e-6;
+
 /// Casts the rays of some pixels, by their place in the region, and writes one over their
 /// depths: 0 for the sky, NaN where a tile is missing. Returns the steps that it took.
 #[inline(always)]
@@ -134,20 +138,11 @@ fn cast_from<L: Lanes>(
         let across = (ray[0] * ray[0] + ray[1] * ray[1]).sqrt();
         let across = across.max(L::F::splat(STRAIGHT_DOWN));
         let inverse = L::F::splat(1.0).div(across);
-        let rows = Rows {
-            rise: ray[2],
-            higher: zero,
-            length: across,
-            longer: zero,
-            first: 0.0,
-            step: 0.0,
-            count: 1,
-            at: L::I::load(&places),
-            pitch: 0,
-        };
+        let rows = Rows::new([ray[2], L::F::splat(NEXT_RAY)], [across, zero], 0, 0);
+        let places = Places { at: L::I::load(&places), pitch: 0, behind: None };
         let lines = Lines::<L>::new(relief, [ray[0] * inverse, ray[1] * inverse]);
         let free = L::F::load(&values[2]) * across;
-        let mut walk = Walk::new(relief, lines, rows, free, FIRST_BLOCK, fineness);
+        let mut walk = Walk::new(relief, lines, rows, places, free, FIRST_BLOCK, fineness);
         walk.run(inverse_depth);
         steps += walk.looked;
     }

@@ -1,9 +1,10 @@
 //! N rays over the level-of-detail surface, each along its own line on the map.
 //!
-//! A ray is held by the direction of its line on the map and by its tangent of elevation at
-//! the camera. Over the Earth, whose rays are straight, a point of the ground is held by the
-//! tangent of the elevation at which it appears (`lines`); so a ray meets the ground at the
-//! first point that appears no lower than it rises (`profile`).
+//! A line has a direction on the map and rays that are numbered as they rise. A point of the
+//! ground over it is held by the ray through it, which is a number between the whole ones,
+//! and by one over its depth; over the Earth, whose rays are straight, from the height at
+//! which it appears (`lines`). So a ray meets the ground at the first point whose number is
+//! no lower than its own (`profile`), and all rays up to that number are answered at once.
 //!
 //! Lanes walk on their own, from cell to cell, and past blocks of cells whose maximum
 //! they clear, as `exact` does. A lane remembers the cell where its last ray ended, with
@@ -21,9 +22,10 @@ mod soils;
 pub(crate) use lines::{Lines, Slopes};
 pub(crate) use soils::{maximum, post};
 
+use crate::column::{TOLD, WHOLE};
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use crate::relief::{Relief, Soil};
-use profile::{Cuts, Profile, Stretch};
+use profile::{Cuts, Profile, Stretch, behind};
 use soils::Soils;
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
@@ -43,20 +45,29 @@ const AHEAD: f32 = 4.0;
 const PATIENCE: i32 = 6;
 
 /// The rays of each line, in the order in which they rise: ray n has the tangent of
-/// elevation `(rise + d higher) / (length + d longer)` with `d = first + n step`, and its
-/// answer belongs at `at + n pitch`. The answer is the inverse depth: the ray's length
-/// along the map, `length + d longer`, over the distance at which it meets the ground. Of
-/// flat ground it is a plane over the picture.
+/// elevation `(rise + n higher) / (length + n longer)`.
 pub(crate) struct Rows<L: Lanes> {
     pub rise: L::F,
     pub higher: L::F,
     pub length: L::F,
     pub longer: L::F,
-    pub first: f32,
-    pub step: f32,
-    pub count: i32,
+    /// `length higher - longer rise`.
+    turn: L::F,
+    /// The first ray, and the last one of those that are cast.
+    pub first: i32,
+    pub last: i32,
+}
+
+/// Where answers belong. What a ray finds is an inverse depth: the ray's length along the map,
+/// `length + n longer`, over the distance at which it meets the ground. Of flat ground it is
+/// a plane over the picture, so that many rays of a line find `a + n b`. For the first of
+/// these `a` is written at `at + (n - first) pitch`, and `b` so many places behind; the
+/// others are left as they are.
+pub(crate) struct Places<L: Lanes> {
     pub at: L::I,
     pub pitch: i32,
+    /// None if there is but one ray: `b` is not wanted then.
+    pub behind: Option<i32>,
 }
 
 /// How fine the ground is looked at.
@@ -76,12 +87,9 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     relief: &'r Relief<'a>,
     lines: Lines<L>,
     rows: Rows<L>,
-    /// The ray that each lane casts, by how much it rises, and its length along the map.
-    row: L::I,
-    rise: L::F,
-    across: L::F,
-    /// One over the distance at which the line leaves the layer.
-    last: L::F,
+    places: Places<L>,
+    /// The ray that each lane casts.
+    ray: L::F,
     /// The plot, or `NOWHERE` if the lane has left the layer or cast its last ray ...
     plot: L::I,
     /// ... and its column and row.
@@ -100,6 +108,8 @@ pub(crate) struct Walk<'r, 'a, L: Lanes> {
     /// Lanes whose ray meets the stretch, and lanes with more vertices in their cell.
     ready: L::M,
     split: L::M,
+    /// Lanes whose cell reaches beyond the layer.
+    beyond: L::M,
     /// A tile was missing on the way.
     unsure: L::M,
     /// Blocks and cells looked at.
@@ -126,11 +136,29 @@ struct Steps<L: Lanes> {
 }
 
 impl<L: Lanes> Rows<L> {
-    /// How much a ray rises, and its length along the map.
+    /// Rays that rise by `rise` over `length`, and by `higher` more over `longer` more from
+    /// ray to ray.
     #[inline(always)]
-    fn ray(&self, row: L::I) -> (L::F, L::F) {
-        let d = L::F::splat(self.first) + row.to_floats() * L::F::splat(self.step);
-        (self.rise + d * self.higher, self.length + d * self.longer)
+    pub(crate) fn new(
+        [rise, higher]: [L::F; 2],
+        [length, longer]: [L::F; 2],
+        first: i32,
+        last: i32,
+    ) -> Self {
+        let turn = length * higher - longer * rise;
+        Rows { rise, higher, length, longer, turn, first, last }
+    }
+
+    /// The last ray.
+    #[inline(always)]
+    fn last(&self) -> L::F {
+        L::F::splat(self.last as f32)
+    }
+
+    /// Tangents of elevation.
+    #[inline(always)]
+    fn tangent(&self, ray: L::F) -> L::F {
+        (self.rise + ray * self.higher).div(self.length + ray * self.longer)
     }
 }
 
@@ -141,6 +169,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         relief: &'r Relief<'a>,
         lines: Lines<L>,
         rows: Rows<L>,
+        places: Places<L>,
         free: L::F,
         block: i32,
         fineness: Fineness,
@@ -154,17 +183,14 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let row = lines.cell_after(relief, 1, free, level, zero, last_row);
         let plot = row.times(L::I::splat(relief.plots[0])) + column;
         let plot = L::I::select(free.lt(lines.leave), plot, L::I::splat(NOWHERE));
-        let (rise, across) = rows.ray(zero);
-        let last = L::F::splat(1.0).div(lines.leave.max(L::F::splat(f32::MIN_POSITIVE)));
+        let ray = L::F::splat(rows.first as f32);
         let none = L::F::splat(0.0);
         Walk {
             relief,
             lines,
             rows,
-            row: zero,
-            rise,
-            across,
-            last,
+            places,
+            ray,
             plot,
             corner: [column, row],
             free,
@@ -185,13 +211,14 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
             fineness,
             ready: L::M::none(),
             split: L::M::none(),
+            beyond: L::M::none(),
             unsure: L::M::none(),
             looked: 0,
         }
     }
 
-    /// Casts all rays. The answers go to `met`: NaN where a missing tile leaves them open,
-    /// and nothing for rays that meet nothing.
+    /// Casts all rays. The answers go to their places in `met`: NaN where a missing tile
+    /// leaves them open, and 0 for rays that meet nothing.
     ///
     /// Rays that meet the ground before their lanes are answered, all that do. Then lanes
     /// go on to the next cell, or look for it among blocks of cells: what most wait for.
@@ -237,48 +264,65 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
                 seeking = seeking | tired;
             }
         }
-        while self.unsure.any() {
-            let at = self.rows.at + self.row.times(L::I::splat(self.rows.pitch));
-            L::F::splat(f32::NAN).scatter(met, at, self.unsure);
-            self.row = self.row + L::I::splat(1);
-            self.unsure = self.unsure & self.row.lt(L::I::splat(self.rows.count));
-        }
+        let none = L::F::splat(0.0);
+        let rest = self.ray.le(self.rows.last());
+        let open = L::F::select(self.unsure, L::F::splat(f32::NAN), none);
+        self.put(met, [open, none], rest);
     }
 
-    /// Answers the rays that meet their stretches, and those behind them that do, too.
+    /// Answers the rays that meet their stretches: the next one of each lane, and those
+    /// behind it that do, too.
     #[inline(always)]
     fn answer(&mut self, soil: &Soils, met: &mut [f32]) {
-        let (one, count) = (L::I::splat(1), L::I::splat(self.rows.count));
-        let pitch = L::I::splat(self.rows.pitch);
         let mut ready = self.ready;
+        self.ready = L::M::none();
         self.steps.passed = L::I::select(ready, L::I::splat(0), self.steps.passed);
-        let mut at = self.rows.at + self.row.times(pitch);
-        // The next ray of each lane, whether it has met this one or not: so none waits to
-        // learn that.
-        let mut next = self.row;
-        let (mut rise, mut across) = (self.rise, self.across);
-        let mut done = L::M::none();
-        while ready.any() {
-            let answer = self.stretch.contact(rise, across);
-            // Coarse cells may reach beyond the layer, where there is nothing to meet.
-            let inside = ready & (across * self.last).lt(answer);
-            let answer = if self.fineness.apart > 0.0 { soil.marked::<L>(answer) } else { answer };
-            let answer = L::F::select(self.unsure, L::F::splat(f32::NAN), answer);
-            answer.scatter(met, at, inside);
-            at = at + pitch;
-            next = next + one;
-            self.row = L::I::select(inside, next, self.row);
-            (rise, across) = self.rows.ray(next);
-            let more = inside & next.lt(count);
-            done = done | (ready & !more);
-            ready = more & self.stretch.is_met(rise, across);
+        let below = ready & self.stretch.is_below(self.ray);
+        if below.any() {
+            let above = self.stretch.above();
+            let wall = self.stretch.wall(&self.rows);
+            self.find(soil, met, wall, below);
+            self.ray = L::F::select(below, above, self.ray);
+            ready = ready & self.stretch.is_met(self.ray) & self.ray.le(self.rows.last());
         }
-        (self.rise, self.across) = self.rows.ray(self.row);
+        let plane = self.stretch.plane();
+        self.find(soil, met, plane, ready);
+        let mut next = self.stretch.next();
+        // Coarse cells may reach beyond the layer, where there is nothing to meet.
+        let beyond = ready & self.beyond;
+        if beyond.any() {
+            let behind = behind::<L>(&self.rows, plane, self.lines.leave);
+            next = L::F::select(beyond, behind.max(self.ray).min(next), next);
+        }
+        self.ray = L::F::select(ready, next, self.ray);
+        let done = beyond | self.rows.last().lt(self.ray);
         if done.any() {
             self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
             self.split = self.split & !done;
         }
-        self.ready = ready;
+    }
+
+    /// Answers for the next ray of lanes and those that see the same plane.
+    #[inline(always)]
+    fn find(&self, soil: &Soils, met: &mut [f32], [start, change]: [L::F; 2], lanes: L::M) {
+        let start = L::F::select(self.unsure, L::F::splat(f32::NAN), start);
+        if self.fineness.apart == 0.0 {
+            return self.put(met, [start, change], lanes);
+        }
+        let marks = soil.marks::<L>(self.stretch.least());
+        let bits = change.to_bits() & L::I::splat(!(WHOLE | TOLD));
+        self.put(met, [start, L::F::from_bits(bits + marks)], lanes);
+    }
+
+    #[inline(always)]
+    fn put(&self, met: &mut [f32], [start, change]: [L::F; 2], lanes: L::M) {
+        let Places { at, pitch, behind } = self.places;
+        let rays = self.ray.truncate() - L::I::splat(self.rows.first);
+        let at = at + rays.times(L::I::splat(pitch));
+        start.scatter(met, at, lanes);
+        if let Some(behind) = behind {
+            change.scatter(met, at + L::I::splat(behind), lanes);
+        }
     }
 
     /// Takes lanes to the next vertices within their cells.
@@ -286,8 +330,8 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
     fn go_on(&mut self) {
         let lanes = self.split;
         let (split, [s, height]) = self.cuts.go_on(lanes);
-        self.stretch.reach(self.relief, s, height, lanes);
-        self.ready = lanes & self.stretch.is_met(self.rise, self.across);
+        self.stretch.reach(self.relief, &self.rows, s, height, lanes);
+        self.ready = lanes & self.stretch.is_met(self.ray);
         self.split = split;
     }
 
@@ -440,7 +484,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         self.looked += u64::from(blocks.count());
         let (out, along_x) = self.exit(within, level + block);
         let highest = soil.maximum::<L>(maximum::<L>(within, block), blocks);
-        let slopes = Slopes::<L>::new(self.relief, self.rise.div(self.across));
+        let slopes = Slopes::<L>::new(self.relief, self.rows.tangent(self.ray));
         let lowest = slopes.height(self.free).min(slopes.height(out))
             - L::F::splat(0.25) * slopes.bend(out - self.free, out);
         let room = L::F::splat(CLEARANCE_M) + lowest.abs() * L::F::splat(CLEARANCE_SHARE);
@@ -541,7 +585,7 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let value = L::F::select(from[0].eq(none), west, value);
         let value = L::F::select(from[0].eq(full), east, value);
         let value = soil.height::<L>(value);
-        self.stretch.begin(self.relief, start, value, lanes);
+        self.stretch.begin(self.relief, &self.rows, start, value, lanes);
         (start, value)
     }
 
@@ -580,11 +624,12 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let curl = twist * (length * self.lines.rate[0]) * (length * self.lines.rate[1]);
         self.height = L::F::select(lanes, high, self.height);
         let solid = solid & lanes;
+        self.beyond = self.lines.leave.lt(end);
         let cell = Profile { start, end, low, high, curl };
         let straight = self.fineness.straight;
         let (split, [s, height]) = self.cuts.begin(self.relief, straight, cell, solid);
         self.split = split;
-        self.stretch.reach(self.relief, s, height, lanes);
-        self.ready = solid & self.stretch.is_met(self.rise, self.across);
+        self.stretch.reach(self.relief, &self.rows, s, height, lanes);
+        self.ready = solid & self.stretch.is_met(self.ray);
     }
 }

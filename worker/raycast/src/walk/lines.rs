@@ -133,13 +133,13 @@ impl<L: Lanes> Slopes<L> {
     }
 }
 
-/// Tangent of the elevation at which the camera sees a point at map distance `s`, with
-/// one over that, and a height over the camera. Over the Earth the terms left out are below
-/// 1e-8 at 300 km.
+/// Height at which the camera sees a point at map distance `s` and a height over the camera:
+/// the tangent of its elevation times `s`. Over the Earth the terms left out are below 1e-8
+/// of that at 300 km.
 #[inline(always)]
-pub(super) fn tangent<L: Lanes>(relief: &Relief, s: L::F, inverse: L::F, height: L::F) -> L::F {
+pub(super) fn seen_height<L: Lanes>(relief: &Relief, s: L::F, height: L::F) -> L::F {
     if relief.curvature == 0.0 {
-        return height * inverse;
+        return height;
     }
     // With r and r0 the distances of the point and of the camera from the centre of the
     // Earth, in its radii, and the angle a = s k between them, the tangent is
@@ -150,8 +150,8 @@ pub(super) fn tangent<L: Lanes>(relief: &Relief, s: L::F, inverse: L::F, height:
     let angle = s * L::F::splat(k as f32);
     let square = angle * angle;
     let share = height * L::F::splat((k / grown) as f32);
-    let rise = height * inverse * L::F::splat((1.0 / grown) as f32) * (one - share * (one - share));
-    let drop = L::F::splat(0.5) * angle * (one - square * L::F::splat(1.0 / 12.0));
+    let rise = height * L::F::splat((1.0 / grown) as f32) * (one - share * (one - share));
+    let drop = L::F::splat(0.5) * angle * s * (one - square * L::F::splat(1.0 / 12.0));
     let sine = square * (L::F::splat(1.0 / 6.0) + square * L::F::splat(7.0 / 360.0));
     (rise - drop) * (one + sine)
 }

@@ -8,7 +8,8 @@
 //! perspective-correct interpolation). Where the ground within a cell, or the Earth under
 //! it, bends too much for that, a cell has more vertices.
 
-use super::lines::tangent;
+use super::Rows;
+use super::lines::seen_height;
 use crate::lanes::{Floats, Ints, Lanes, Mask};
 use crate::relief::Relief;
 
@@ -17,6 +18,11 @@ const MOST_STRETCHES: f32 = 64.0;
 /// What counts as no distance from the camera, metres: less than that of what a ray along
 /// the axis sees from a millimetre.
 const NO_DISTANCE: f32 = 1e-9;
+/// Beyond all rays there are: these are whole numbers that an f32 holds.
+const FARTHEST_RAY: f32 = (1 << 22) as f32;
+/// Part of the way from ray to ray within which ground counts as equally far. Rounding is up
+/// to a tenth of that a thousand rays from the first.
+const SHORT_RAYS: f32 = 1.0 / 512.0;
 
 /// The ground of a cell along a line, over the camera.
 #[derive(Clone, Copy)]
@@ -42,19 +48,25 @@ pub(super) struct Cuts<L: Lanes> {
     step: L::F,
 }
 
-/// The ground between the last two vertices.
+/// A point of the ground over each line, as the camera sees it.
+#[derive(Clone, Copy)]
+struct Vertex<L: Lanes> {
+    /// Distance along the map.
+    s: L::F,
+    /// The ray through it, between the whole ones; and one over its depth, so that over
+    /// a straight stretch this is linear in the ray. Behind the camera's plane, where rays
+    /// of the line never come to, both go on beyond infinity: the depth is negative.
+    ray: L::F,
+    inverse: L::F,
+    /// Up to this, rays do not pass over it.
+    limit: L::F,
+}
+
+/// The ground between two vertices.
 #[derive(Clone, Copy)]
 pub(super) struct Stretch<L: Lanes> {
-    /// The last vertex: one over its distance, and its tangent of elevation.
-    inverse: L::F,
-    tangent: L::F,
-    /// One over the distance of the vertex before.
-    near: L::F,
-    /// One over the distance at the tangent of the last vertex, and how it changes.
-    base: L::F,
-    rate: L::F,
-    /// Rays of tangents up to this meet the stretch.
-    limit: L::F,
+    before: Vertex<L>,
+    last: Vertex<L>,
 }
 
 impl<L: Lanes> Cuts<L> {
@@ -133,53 +145,120 @@ impl<L: Lanes> Profile<L> {
     }
 }
 
+impl<L: Lanes> Vertex<L> {
+    fn none() -> Self {
+        let zero = L::F::splat(0.0);
+        Vertex { s: zero, ray: zero, inverse: zero, limit: zero }
+    }
+
+    /// A point at a distance `s`, of a height over the camera.
+    #[inline(always)]
+    fn new(relief: &Relief, rows: &Rows<L>, s: L::F, height: L::F) -> Self {
+        let zero = L::F::splat(0.0);
+        let s = s.max(L::F::splat(NO_DISTANCE));
+        let height = seen_height::<L>(relief, s, height);
+        let depth = rows.higher * s - rows.longer * height;
+        let least = L::F::splat(f32::MIN_POSITIVE);
+        let depth = L::F::select(depth.eq(zero), least, depth);
+        let share = L::F::splat(1.0).div(depth);
+        let ray = (height * rows.length - rows.rise * s) * share;
+        let limit = L::F::select(zero.lt(depth), ray, L::F::splat(f32::INFINITY));
+        Vertex { s, ray, inverse: rows.turn * share, limit }
+    }
+
+    #[inline(always)]
+    fn select(lanes: L::M, yes: Self, no: Self) -> Self {
+        Vertex {
+            s: L::F::select(lanes, yes.s, no.s),
+            ray: L::F::select(lanes, yes.ray, no.ray),
+            inverse: L::F::select(lanes, yes.inverse, no.inverse),
+            limit: L::F::select(lanes, yes.limit, no.limit),
+        }
+    }
+}
+
 impl<L: Lanes> Stretch<L> {
     pub fn new() -> Self {
-        let zero = L::F::splat(0.0);
-        Stretch { inverse: zero, tangent: zero, near: zero, base: zero, rate: zero, limit: zero }
+        Stretch { before: Vertex::none(), last: Vertex::none() }
     }
 
     /// Puts the first vertex of a piece of ground.
     #[inline(always)]
-    pub fn begin(&mut self, relief: &Relief, s: L::F, height: L::F, lanes: L::M) {
-        let s = s.max(L::F::splat(NO_DISTANCE));
-        let inverse = L::F::splat(1.0).div(s);
-        let tangent = tangent::<L>(relief, s, inverse, height);
-        self.inverse = L::F::select(lanes, inverse, self.inverse);
-        self.tangent = L::F::select(lanes, tangent, self.tangent);
+    pub fn begin(&mut self, relief: &Relief, rows: &Rows<L>, s: L::F, height: L::F, lanes: L::M) {
+        let vertex = Vertex::new(relief, rows, s, height);
+        self.last = Vertex::select(lanes, vertex, self.last);
     }
 
     /// Goes on to the next vertex.
     #[inline(always)]
-    pub fn reach(&mut self, relief: &Relief, s: L::F, height: L::F, lanes: L::M) {
-        let s = s.max(L::F::splat(NO_DISTANCE));
-        let inverse = L::F::splat(1.0).div(s);
-        let tangent = tangent::<L>(relief, s, inverse, height);
-        let rises = self.tangent.lt(tangent);
-        let rate = (inverse - self.inverse).div(tangent - self.tangent);
-        let rate = L::F::select(rises, rate, L::F::splat(0.0));
-        let base = L::F::select(rises, inverse, self.inverse);
-        let limit = self.tangent.max(tangent);
-        self.rate = L::F::select(lanes, rate, self.rate);
-        self.base = L::F::select(lanes, base, self.base);
-        self.limit = L::F::select(lanes, limit, self.limit);
-        self.near = L::F::select(lanes, self.inverse, self.near);
-        self.inverse = L::F::select(lanes, inverse, self.inverse);
-        self.tangent = L::F::select(lanes, tangent, self.tangent);
+    pub fn reach(&mut self, relief: &Relief, rows: &Rows<L>, s: L::F, height: L::F, lanes: L::M) {
+        let vertex = Vertex::new(relief, rows, s, height);
+        self.before = Vertex::select(lanes, self.last, self.before);
+        self.last = Vertex::select(lanes, vertex, self.last);
     }
 
-    /// Whether rays that rise by `rise` over `across` meet the stretch, if they have passed
-    /// over all before.
+    /// Whether a ray meets the stretch, if it has passed over all before.
     #[inline(always)]
-    pub fn is_met(&self, rise: L::F, across: L::F) -> L::M {
-        rise.le(self.limit * across)
+    pub fn is_met(&self, ray: L::F) -> L::M {
+        ray.le(self.before.limit.max(self.last.limit))
     }
 
-    /// One over the distance at which they meet it, times `across`. Ground that does not
-    /// rise as seen from the camera is met where it begins, as by rays from below it.
+    /// The first ray that passes over the stretch.
     #[inline(always)]
-    pub fn contact(&self, rise: L::F, across: L::F) -> L::F {
-        let found = across * self.base + self.rate * (rise - self.tangent * across);
-        found.min(across * self.near)
+    pub fn next(&self) -> L::F {
+        after::<L>(self.before.limit.max(self.last.limit))
     }
+
+    /// Whether a ray comes from below the ground where the stretch begins: if it has met none
+    /// before.
+    #[inline(always)]
+    pub fn is_below(&self, ray: L::F) -> L::M {
+        ray.le(self.before.limit)
+    }
+
+    /// The first ray that does not.
+    #[inline(always)]
+    pub fn above(&self) -> L::F {
+        after::<L>(self.before.limit)
+    }
+
+    /// What rays from below find: one over the depth of the ground at the distance at which
+    /// the stretch begins, at ray 0, and how that changes from ray to ray.
+    #[inline(always)]
+    pub fn wall(&self, rows: &Rows<L>) -> [L::F; 2] {
+        let inverse = L::F::splat(1.0).div(self.before.s);
+        [rows.length * inverse, rows.longer * inverse]
+    }
+
+    /// One over the depth of the plane that goes along the stretch, at ray 0, and how that
+    /// changes from ray to ray.
+    #[inline(always)]
+    pub fn plane(&self) -> [L::F; 2] {
+        let (before, last) = (&self.before, &self.last);
+        let rays = last.ray - before.ray;
+        let change = (last.inverse - before.inverse).div(rays);
+        let short = rays.abs().lt(L::F::splat(SHORT_RAYS));
+        let change = L::F::select(short, L::F::splat(0.0), change);
+        [before.inverse - before.ray * change, change]
+    }
+
+    /// One over the depth at which the stretch ends.
+    #[inline(always)]
+    pub fn least(&self) -> L::F {
+        self.last.inverse
+    }
+}
+
+/// The first ray behind a distance that meets a plane, as [`Stretch::plane`] has it.
+#[inline(always)]
+pub(super) fn behind<L: Lanes>(rows: &Rows<L>, [start, change]: [L::F; 2], s: L::F) -> L::F {
+    let inverse = L::F::splat(1.0).div(s.max(L::F::splat(NO_DISTANCE)));
+    after::<L>((rows.length * inverse - start).div(change - rows.longer * inverse))
+}
+
+/// The first whole ray after a place between rays.
+#[inline(always)]
+fn after<L: Lanes>(ray: L::F) -> L::F {
+    let most = L::F::splat(FARTHEST_RAY);
+    (ray.max(-most).min(most).floor() + L::I::splat(1)).to_floats()
 }

@@ -120,13 +120,11 @@ impl Soils {
         }
     }
 
-    /// Inverse depths with their last bits set to [`WHOLE`] and [`TOLD`].
+    /// What is known of ground whose inverse depth is no less: [`WHOLE`] and [`TOLD`].
     #[inline(always)]
-    pub fn marked<L: Lanes>(&self, answer: L::F) -> L::F {
-        let told = L::F::load(&self.told).le(answer);
-        let told = L::I::select(told, L::I::splat(TOLD), L::I::splat(0));
-        let bits = answer.to_bits() & L::I::splat(!(WHOLE | TOLD));
-        L::F::from_bits(bits + L::I::load(&self.whole) + told)
+    pub fn marks<L: Lanes>(&self, inverse: L::F) -> L::I {
+        let told = L::F::load(&self.told).le(inverse);
+        L::I::load(&self.whole) + L::I::select(told, L::I::splat(TOLD), L::I::splat(0))
     }
 
     /// What to add to the place of a post to come to the next row, forward or back.
