@@ -9,8 +9,9 @@ use terrafarm_common::region::Region;
 /// Rows that are written at once, at most: as many as a line of the cache has pixels. They end
 /// at multiples of it, as lines do where regions begin at such.
 const ROWS: usize = 16;
-/// Room for a row, pixels.
-const PITCH: usize = super::WIDEST_PX as usize;
+/// Room for a row, pixels. One line of the cache more than needed, or the rows would all lie in
+/// the same few places of it.
+const PITCH: usize = super::WIDEST_PX as usize + 16;
 
 /// Rows one after another, none of them empty, and the pixels of each.
 #[derive(Default)]
@@ -55,11 +56,22 @@ impl Turned {
             .iter()
             .fold(0..u32::MAX, |common, row| common.start.max(row.start)..common.end.min(row.end));
         // All that every row has ...
-        for minor in common.clone() {
-            let at = (minor - region.y) as usize * width + (self.first - region.x) as usize;
-            let values = self.values[(minor - self.start) as usize..].iter().step_by(PITCH);
-            for (depth, &value) in depths[at..at + count].iter_mut().zip(values) {
-                *depth = value;
+        let at = |minor: u32| {
+            (minor - region.y) as usize * width + (self.first - region.x) as usize
+        };
+        let (rows, _) = self.values.as_chunks::<PITCH>();
+        if let Ok(rows) = <&[[f32; PITCH]; ROWS]>::try_from(&rows[..count]) {
+            for minor in common.clone() {
+                let from = (minor - self.start) as usize;
+                let line: [f32; ROWS] = std::array::from_fn(|n| rows[n][from]);
+                depths[at(minor)..][..ROWS].copy_from_slice(&line);
+            }
+        } else {
+            for minor in common.clone() {
+                let from = (minor - self.start) as usize;
+                for (depth, row) in depths[at(minor)..][..count].iter_mut().zip(rows) {
+                    *depth = row[from];
+                }
             }
         }
         // ... and what only some have.
