@@ -7,15 +7,15 @@
 //! there are: neighbours are six pixels apart for each pixel of tolerance, but at most four.
 //!
 //! What rays find is kept as inverse depth, which over a plane is linear in the picture: the
-//! rays of a line that see the same plane are answered together (`planes`). There is a ray in each row for each line, so a pixel lies between two rays. Where the
-//! rays around these bend no more than the tolerance allows, and the posts of the ground
-//! are further apart than lines, the pixel is between the two (`net`). Where they bend more
-//! it is compared with the surface at that very place, and moved along its own ray until it
-//! is there; where the two see different ground it is looked for on the nearer, then on the
-//! other (`doubts`). Closer ground that ends a few rows below may come to a peak between the
-//! lines: there it is tried first. What is not found so, and what is close to V, has a ray of its own,
-//! that of `lod`. What a pixel can miss is ground in front that is narrower than the
-//! distance between lines.
+//! rays of a line that see the same plane are answered together (`planes`). There is a ray in
+//! each row for each line, so a pixel lies between two rays. Where the rays around these bend
+//! no more than the tolerance allows, and the posts of the ground are further apart than
+//! lines, the pixel is between the two (`net`). Where they bend more it is compared with the
+//! surface at that very place, and moved along its own ray until it is there; where the two
+//! see different ground it is looked for on the nearer, then on the other (`doubts`). Closer
+//! ground that ends a few rows below may come to a peak between the lines: there it is tried
+//! first. What is not found so, and what is close to V, has a ray of its own, that of `lod`.
+//! What a pixel can miss is ground in front that is narrower than the distance between lines.
 
 mod doubts;
 mod net;

@@ -15,22 +15,25 @@
 //! where a line crosses the grid is one expression, a cell's answer depends on nothing but
 //! the cell, and a block is passed only with more room than all rounding takes.
 
+mod answers;
 mod lines;
 mod profile;
+mod rows;
 mod soils;
 
 pub(crate) use lines::{Lines, Slopes};
+pub(crate) use rows::{Places, Rows};
 pub(crate) use soils::{maximum, post};
 
-use crate::column::{TOLD, WHOLE};
 use crate::lanes::{Floats, Ints, Lanes, MOST, Mask};
 use crate::relief::{Relief, Soil};
-use profile::{Cuts, Profile, Stretch, behind};
+use profile::{Cuts, Profile, Stretch};
 use soils::Soils;
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
 
 /// How far above a block's maximum a ray must stay to pass it: metres, and a share of its
-/// height over or under the camera. Rounding is an eighth of that.
+/// height over or under the camera. Rounding is an eighth of that; what rounding adds to the
+/// ray itself comes on top.
 const CLEARANCE_M: f32 = 0.02;
 const CLEARANCE_SHARE: f32 = 2e-6;
 /// The plot of lanes that have left the layer.
@@ -44,41 +47,16 @@ const AHEAD: f32 = 4.0;
 /// views of `bench core`.
 const PATIENCE: i32 = 6;
 
-/// The rays of each line, in the order in which they rise: ray n has the tangent of
-/// elevation `(rise + n higher) / (length + n longer)`.
-pub(crate) struct Rows<L: Lanes> {
-    pub rise: L::F,
-    pub higher: L::F,
-    pub length: L::F,
-    pub longer: L::F,
-    /// `length higher - longer rise`.
-    turn: L::F,
-    /// The first ray, and the last one of those that are cast.
-    pub first: i32,
-    pub last: i32,
-}
-
-/// Where answers belong. What a ray finds is an inverse depth: the ray's length along the map,
-/// `length + n longer`, over the distance at which it meets the ground. Of flat ground it is
-/// a plane over the picture, so that many rays of a line find `a + n b`. For the first of
-/// these `a` is written at `at + (n - first) pitch`, and `b` so many places behind; the
-/// others are left as they are.
-pub(crate) struct Places<L: Lanes> {
-    pub at: L::I,
-    pub pitch: i32,
-    /// None if there is but one ray: `b` is not wanted then.
-    pub behind: Option<i32>,
-}
-
 /// How fine the ground is looked at.
 #[derive(Clone, Copy)]
 pub(crate) struct Fineness {
     /// Vertical distance that may be between the ground and straight lines, metres for each
     /// metre away.
     pub straight: f32,
-    /// Distance between rays, metres for each metre of depth. The last bits of an answer
-    /// are [`crate::column::WHOLE`] if no post of the tile is void, and [`crate::column::TOLD`] if besides posts are
-    /// further apart where it lies. With 0 for the distance they are not.
+    /// Distance between rays, metres for each metre of depth. The last bits of an answer's `b`
+    /// (see [`Places`]) are [`crate::column::WHOLE`] if no post of the tile is void, and
+    /// [`crate::column::TOLD`] if besides posts are further apart where it lies. With 0 for the
+    /// distance they are not.
     pub apart: f32,
 }
 
@@ -133,33 +111,6 @@ struct Steps<L: Lanes> {
     ahead: L::I,
     /// Cells passed since the last hit.
     passed: L::I,
-}
-
-impl<L: Lanes> Rows<L> {
-    /// Rays that rise by `rise` over `length`, and by `higher` more over `longer` more from
-    /// ray to ray.
-    #[inline(always)]
-    pub(crate) fn new(
-        [rise, higher]: [L::F; 2],
-        [length, longer]: [L::F; 2],
-        first: i32,
-        last: i32,
-    ) -> Self {
-        let turn = length * higher - longer * rise;
-        Rows { rise, higher, length, longer, turn, first, last }
-    }
-
-    /// The last ray.
-    #[inline(always)]
-    fn last(&self) -> L::F {
-        L::F::splat(self.last as f32)
-    }
-
-    /// Tangents of elevation.
-    #[inline(always)]
-    fn tangent(&self, ray: L::F) -> L::F {
-        (self.rise + ray * self.higher).div(self.length + ray * self.longer)
-    }
 }
 
 impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
@@ -268,61 +219,6 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         let rest = self.ray.le(self.rows.last());
         let open = L::F::select(self.unsure, L::F::splat(f32::NAN), none);
         self.put(met, [open, none], rest);
-    }
-
-    /// Answers the rays that meet their stretches: the next one of each lane, and those
-    /// behind it that do, too.
-    #[inline(always)]
-    fn answer(&mut self, soil: &Soils, met: &mut [f32]) {
-        let mut ready = self.ready;
-        self.ready = L::M::none();
-        self.steps.passed = L::I::select(ready, L::I::splat(0), self.steps.passed);
-        let below = ready & self.stretch.is_below(self.ray);
-        if below.any() {
-            let above = self.stretch.above();
-            let wall = self.stretch.wall(&self.rows);
-            self.find(soil, met, wall, below);
-            self.ray = L::F::select(below, above, self.ray);
-            ready = ready & self.stretch.is_met(self.ray) & self.ray.le(self.rows.last());
-        }
-        let plane = self.stretch.plane();
-        self.find(soil, met, plane, ready);
-        let mut next = self.stretch.next();
-        // Coarse cells may reach beyond the layer, where there is nothing to meet.
-        let beyond = ready & self.beyond;
-        if beyond.any() {
-            let behind = behind::<L>(&self.rows, plane, self.lines.leave);
-            next = L::F::select(beyond, behind.max(self.ray).min(next), next);
-        }
-        self.ray = L::F::select(ready, next, self.ray);
-        let done = beyond | self.rows.last().lt(self.ray);
-        if done.any() {
-            self.plot = L::I::select(done, L::I::splat(NOWHERE), self.plot);
-            self.split = self.split & !done;
-        }
-    }
-
-    /// Answers for the next ray of lanes and those that see the same plane.
-    #[inline(always)]
-    fn find(&self, soil: &Soils, met: &mut [f32], [start, change]: [L::F; 2], lanes: L::M) {
-        let start = L::F::select(self.unsure, L::F::splat(f32::NAN), start);
-        if self.fineness.apart == 0.0 {
-            return self.put(met, [start, change], lanes);
-        }
-        let marks = soil.marks::<L>(self.stretch.least());
-        let bits = change.to_bits() & L::I::splat(!(WHOLE | TOLD));
-        self.put(met, [start, L::F::from_bits(bits + marks)], lanes);
-    }
-
-    #[inline(always)]
-    fn put(&self, met: &mut [f32], [start, change]: [L::F; 2], lanes: L::M) {
-        let Places { at, pitch, behind } = self.places;
-        let rays = self.ray.truncate() - L::I::splat(self.rows.first);
-        let at = at + rays.times(L::I::splat(pitch));
-        start.scatter(met, at, lanes);
-        if let Some(behind) = behind {
-            change.scatter(met, at + L::I::splat(behind), lanes);
-        }
     }
 
     /// Takes lanes to the next vertices within their cells.
@@ -484,10 +380,12 @@ impl<'r, 'a, L: Lanes> Walk<'r, 'a, L> {
         self.looked += u64::from(blocks.count());
         let (out, along_x) = self.exit(within, level + block);
         let highest = soil.maximum::<L>(maximum::<L>(within, block), blocks);
-        let slopes = Slopes::<L>::new(self.relief, self.rows.tangent(self.ray));
+        let (tangent, rounded) = self.rows.tangent(self.ray);
+        let slopes = Slopes::<L>::new(self.relief, tangent);
         let lowest = slopes.height(self.free).min(slopes.height(out))
             - L::F::splat(0.25) * slopes.bend(out - self.free, out);
         let room = L::F::splat(CLEARANCE_M) + lowest.abs() * L::F::splat(CLEARANCE_SHARE);
+        let room = room + rounded * out;
         let clear = blocks & (highest + room).lt(lowest);
         // The cell behind the line by which the block is left; beside it, the cell that the
         // line has come to within the block.

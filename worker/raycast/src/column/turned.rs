@@ -56,9 +56,8 @@ impl Turned {
             .iter()
             .fold(0..u32::MAX, |common, row| common.start.max(row.start)..common.end.min(row.end));
         // All that every row has ...
-        let at = |minor: u32| {
-            (minor - region.y) as usize * width + (self.first - region.x) as usize
-        };
+        let at =
+            |minor: u32| (minor - region.y) as usize * width + (self.first - region.x) as usize;
         let (rows, _) = self.values.as_chunks::<PITCH>();
         if let Ok(rows) = <&[[f32; PITCH]; ROWS]>::try_from(&rows[..count]) {
             for minor in common.clone() {

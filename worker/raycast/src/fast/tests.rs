@@ -161,6 +161,73 @@ fn what_is_seen_is_on_the_surface_to_the_tolerance() {
     assert!(ground > pixels / 12, "{ground} of {pixels} pixels see the ground");
 }
 
+#[test]
+fn ground_close_to_the_camera_is_seen_whatever_way_it_looks() {
+    let (mut near, mut sky, mut missed) = (0, 0, 0);
+    for (number, land) in single_layered().iter().enumerate() {
+        let layer = &land.resident.index().layers[0];
+        let far = layer.far_corner();
+        let mut dice = Dice::new(300 + number as u64);
+        for round in 0..count(14) {
+            let [x, y] = [0, 1].map(|n| {
+                let side = far[n] - layer.origin[n];
+                layer.origin[n] + side * dice.between(0.05, 0.95)
+            });
+            let Some(ground) = land.height(x, y, land.pyramid.highest() + 1.0) else { continue };
+            let above = [2.0, 30.0, 1000.0][dice.below(3) as usize];
+            let pitches = [-90.0, -89.9, -45.0, -10.0, 0.0, 5.0, 30.0, 60.0];
+            let pitch = pitches[dice.below(8) as usize];
+            let roll = [0.0, 90.0, dice.between(-180.0, 180.0)][dice.below(3) as usize];
+            let eye = DVec3::new(x, y, ground + above);
+            let camera =
+                Camera::from_angles(eye, dice.between(0.0, 360.0), pitch, roll, 60.0, SIZE);
+            let method = [quality::Method::Lod, quality::Method::Column][(round % 2) as usize];
+            let view = view(camera, &mut dice, method);
+            let exact = Quality { method: quality::Method::Exact, ..view.quality };
+            let exact = View { quality: exact, ..view.clone() };
+            let whole = Region::whole(SIZE.0, SIZE.1);
+            let seen = depths(&land.resident, &land.pyramid, &view, whole).unwrap();
+            // What is ground, or sky, all around a pixel is so there.
+            let reach = view.quality.tolerance_px + 1.0;
+            for [x, y] in whole.pixels().step_by(11) {
+                let at = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+                let around = [[0.0, 0.0], [reach, 0.0], [-reach, 0.0], [0.0, reach], [0.0, -reach]];
+                let hits = around.map(|by| {
+                    let place =
+                        [0, 1].map(|n| (at[n] + by[n]).clamp(0.0, f64::from([SIZE.0, SIZE.1][n])));
+                    land.look(&exact, place).map(|hit| (hit.position - eye).length())
+                });
+                let claimed = seen.distance_m(&view, x, y);
+                let said = format!("{} {method} {view:?} {x} {y}: {claimed}, {hits:?}", land.name);
+                if let [Some(distance), Some(_), Some(_), Some(_), Some(_)] = hits {
+                    // What is narrower than the way between lines `column` may miss.
+                    let is_seen = claimed.is_finite() && claimed > 0.0;
+                    assert!(is_seen || method == quality::Method::Column, "{said}");
+                    missed += i32::from(!is_seen);
+                    near += i32::from(distance < 8.0 * layer.spacing[0]);
+                }
+                if hits == [None; 5] {
+                    let is_sky = claimed.is_infinite();
+                    assert!(is_sky || method == quality::Method::Column, "{said}");
+                    missed += i32::from(!is_sky);
+                    sky += 1;
+                }
+                // Closer than two metres rounding counts: heights are held to some hundredths of a millimetre.
+                if claimed.is_finite() && claimed > 2.0 && !on_a_wall(land, &view, x, y) {
+                    let (resident, pyramid) = (&land.resident, &land.pyramid);
+                    let error = measure(resident, pyramid, &view, x, y, claimed).unwrap();
+                    // Between its lines `column` keeps the tolerance for 99 pixels of 100.
+                    let times = if method == quality::Method::Lod { 1.0 } else { 2.0 };
+                    let allowed = times * view.quality.tolerance_px + 0.1;
+                    assert!(error.surface_px <= allowed, "{said}: {error:?}");
+                }
+            }
+        }
+    }
+    assert!(missed * 1000 <= near, "{missed} missed of {near}");
+    assert!(near > 2000 && sky > 2000, "{near} pixels of near ground, {sky} of sky");
+}
+
 /// Whether the exact ray meets a wall: the rim of a void or of the land, which is no
 /// height above any place.
 fn on_a_wall(land: &Land, view: &View, x: u32, y: u32) -> bool {

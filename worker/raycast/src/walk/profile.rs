@@ -1,10 +1,10 @@
 //! The ground along N lines: from vertex to vertex, and which rays meet it in between.
 //!
-//! A vertex is a point of the ground over a line. Seen from the camera it has a tangent of
-//! elevation T, and from one vertex to the next the ground counts as straight: along it one
-//! over the map distance is linear in T. So a stretch between two vertices is met by the
-//! rays with tangents up to the greater of its two, and where is a multiplication and an
-//! addition (the drawing step of voxel columns, Cohen-Or et al., section 2, with
+//! A vertex is a point of the ground over a line. Seen from the camera it lies on a ray, whose
+//! number is between the whole ones, at a depth; from one vertex to the next the ground counts
+//! as straight: along it one over the depth is linear in the number. So a stretch between
+//! two vertices is met by the rays up to the greater of its two numbers, and all of them find
+//! `a + n b` (the drawing step of voxel columns, Cohen-Or et al., section 2, with
 //! perspective-correct interpolation). Where the ground within a cell, or the Earth under
 //! it, bends too much for that, a cell has more vertices.
 
@@ -18,6 +18,8 @@ const MOST_STRETCHES: f32 = 64.0;
 /// What counts as no distance from the camera, metres: less than that of what a ray along
 /// the axis sees from a millimetre.
 const NO_DISTANCE: f32 = 1e-9;
+/// What counts as no depth: one over it, times metres, is still a number.
+const NO_DEPTH: f32 = 1e-20;
 /// Beyond all rays there are: these are whole numbers that an f32 holds.
 const FARTHEST_RAY: f32 = (1 << 22) as f32;
 /// Part of the way from ray to ray within which ground counts as equally far. Rounding is up
@@ -54,11 +56,12 @@ struct Vertex<L: Lanes> {
     /// Distance along the map.
     s: L::F,
     /// The ray through it, between the whole ones; and one over its depth, so that over
-    /// a straight stretch this is linear in the ray. Behind the camera's plane, where rays
-    /// of the line never come to, both go on beyond infinity: the depth is negative.
+    /// a straight stretch this is linear in the ray. Behind the plane through the camera, where
+    /// rays of the line never come to, both go on beyond infinity: the depth is negative.
     ray: L::F,
     inverse: L::F,
-    /// Up to this, rays do not pass over it.
+    /// Up to this, rays do not pass over it. Behind the plane that is all of them, if the plane
+    /// rises along the line and the point is above it, or none, if it falls.
     limit: L::F,
 }
 
@@ -158,11 +161,11 @@ impl<L: Lanes> Vertex<L> {
         let s = s.max(L::F::splat(NO_DISTANCE));
         let height = seen_height::<L>(relief, s, height);
         let depth = rows.higher * s - rows.longer * height;
-        let least = L::F::splat(f32::MIN_POSITIVE);
-        let depth = L::F::select(depth.eq(zero), least, depth);
+        let least = L::F::splat(NO_DEPTH);
+        let depth = L::F::select(depth.abs().lt(least), least, depth);
         let share = L::F::splat(1.0).div(depth);
         let ray = (height * rows.length - rows.rise * s) * share;
-        let limit = L::F::select(zero.lt(depth), ray, L::F::splat(f32::INFINITY));
+        let limit = L::F::select(zero.lt(depth), ray, rows.hidden);
         Vertex { s, ray, inverse: rows.turn * share, limit }
     }
 
@@ -239,19 +242,24 @@ impl<L: Lanes> Stretch<L> {
         let change = (last.inverse - before.inverse).div(rays);
         let short = rays.abs().lt(L::F::splat(SHORT_RAYS));
         let change = L::F::select(short, L::F::splat(0.0), change);
-        [before.inverse - before.ray * change, change]
+        // From the vertex closer to ray 0: the other one may be so far from it that nothing is
+        // left of what is added.
+        let near = before.ray.abs().le(last.ray.abs());
+        let ray = L::F::select(near, before.ray, last.ray);
+        let inverse = L::F::select(near, before.inverse, last.inverse);
+        [inverse - ray * change, change]
     }
 
-    /// One over the depth at which the stretch ends.
+    /// One over the greater depth of the two vertices.
     #[inline(always)]
     pub fn least(&self) -> L::F {
-        self.last.inverse
+        self.before.inverse.min(self.last.inverse)
     }
 }
 
 /// The first ray behind a distance that meets a plane, as [`Stretch::plane`] has it.
 #[inline(always)]
-pub(super) fn behind<L: Lanes>(rows: &Rows<L>, [start, change]: [L::F; 2], s: L::F) -> L::F {
+pub(super) fn first_behind<L: Lanes>(rows: &Rows<L>, [start, change]: [L::F; 2], s: L::F) -> L::F {
     let inverse = L::F::splat(1.0).div(s.max(L::F::splat(NO_DISTANCE)));
     after::<L>((rows.length * inverse - start).div(change - rows.longer * inverse))
 }
