@@ -78,8 +78,7 @@ impl Turned {
             let before = row.start..row.end.min(common.start.max(row.start));
             let after = row.start.max(common.end.max(before.end))..row.end;
             for minor in before.chain(after) {
-                let at = (minor - region.y) as usize * width + (self.first - region.x) as usize + n;
-                depths[at] = self.values[n * PITCH + (minor - self.start) as usize];
+                depths[at(minor) + n] = self.values[n * PITCH + (minor - self.start) as usize];
             }
         }
     }

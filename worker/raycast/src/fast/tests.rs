@@ -235,11 +235,11 @@ fn ground_close_to_the_camera_is_seen_whatever_way_it_looks() {
     assert!(near > 2000 && sky > 2000, "{near} pixels of near ground, {sky} of sky");
 }
 
-/// How many of so many pixels may be off by more than the tolerance: none of the first ten
-/// thousand. In long runs some are, where single precision does not tell edges of cliffs and
-/// of voids apart.
+/// How many of so many pixels may be off by more than the tolerance: none, but in long runs.
+/// These find some, of `lod` over the land of cliffs, and of `column` mostly over those of tiles,
+/// hills and voids; why is not known.
 fn few(pixels: u64) -> u64 {
-    pixels / 10_000 * 4
+    if count(1) == 1 { 0 } else { pixels / 10_000 * 4 }
 }
 
 /// Whether the exact ray meets a wall: the rim of a void or of the land, which is no
