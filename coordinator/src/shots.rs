@@ -373,14 +373,11 @@ impl Shots {
         }
     }
 
-    /// Counts the time of a worker, whose result may have been refused: no more than has
-    /// passed since it was counted last, or since the worker was granted its first job.
+    /// Counts the time of a worker, whose result may have been refused.
     pub fn count_time(&mut self, shot: ShotId, worker: &str, sheet: &Timesheet, now: Micros) {
         let Some(state) = self.shots.get_mut(&shot) else { return };
         if let Some(share) = state.shares.get_mut(worker) {
-            let until = now.since(state.since);
-            share.timesheet.add(&sheet.within(until.saturating_sub(share.last_us)));
-            share.last_us = until;
+            share.count(sheet, now.since(state.since));
         }
     }
 

@@ -345,6 +345,18 @@ pub struct WorkerShare {
     pub timesheet: Timesheet,
 }
 
+impl WorkerShare {
+    /// Adds the sheet of a result that came so many microseconds after the submission: with
+    /// those before it, no more than has passed since the first grant. From one result to the
+    /// next it may well be more, for the one before may have been longer under way.
+    pub fn count(&mut self, sheet: &Timesheet, came_us: u64) {
+        let passed_us = came_us.saturating_sub(self.first_us);
+        let uncounted_us = passed_us.saturating_sub(self.timesheet.total_us());
+        self.timesheet.add(&sheet.within(uncounted_us));
+        self.last_us = came_us;
+    }
+}
+
 /// Every frame is made or has failed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ShotDone {
@@ -390,5 +402,43 @@ impl Body for ShotFailed {
 
     fn check(&self) -> Result<(), Unfit> {
         fit_reason(&self.reason)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn share(first_us: u64) -> WorkerShare {
+        WorkerShare {
+            name: "attic".into(),
+            jobs: 0,
+            cost_us: 0,
+            first_us,
+            last_us: first_us,
+            timesheet: Timesheet::default(),
+        }
+    }
+
+    fn rendered(render_us: u64) -> Timesheet {
+        Timesheet { render_us, ..Timesheet::default() }
+    }
+
+    #[test]
+    fn results_that_are_held_up_under_way_lose_none_of_a_workers_time() {
+        let mut share = share(100);
+        // Jobs of 50; the first result is 30 under way, the second comes at once.
+        share.count(&rendered(50), 180);
+        share.count(&rendered(50), 200);
+        assert_eq!((share.timesheet.render_us, share.last_us), (100, 200));
+    }
+
+    #[test]
+    fn time_before_the_first_grant_is_not_counted() {
+        let mut share = share(100);
+        share.count(&Timesheet { redo_us: 500, ..rendered(50) }, 160);
+        assert_eq!(share.timesheet, Timesheet { redo_us: 10, ..rendered(50) });
+        share.count(&rendered(40), 200);
+        assert_eq!(share.timesheet.total_us(), 100);
     }
 }

@@ -61,9 +61,9 @@ const CLEARED_M: f64 = 200.0;
 const TOLERANCE_PX: f64 = 0.5;
 /// Height of the camera over the yard, metres: above its noise.
 const YARD_HEIGHT_M: f64 = 5_000.0;
-/// The short form.
+/// The short form: long enough that a wait of a few milliseconds for a core is little of it.
 const SHORT_SIZE: (u32, u32) = (160, 90);
-const SHORT_FRAMES: u32 = 8;
+const SHORT_FRAMES: u32 = 96;
 
 /// What is written as JSON. Keys are promises.
 #[derive(Debug, Serialize)]
