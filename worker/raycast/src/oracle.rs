@@ -1,7 +1,7 @@
 //! Tests of the pictures against everything that knows better: the slow twin, rational
 //! arithmetic, spherical trigonometry, and the same picture under another split.
 //!
-//! They use what the crate offers to others and nothing else. `TERRAFARM_LONG=1` casts
+//! They use what the crate offers to others and nothing else. `TERRAFARM_LONG=20` casts
 //! twenty times as many rays.
 
 mod flight;
@@ -82,13 +82,10 @@ pub(crate) fn bare(earth: Option<Earth>) -> Shading {
     Shading { earth, below_ground: [0.5, 0.0, 0.5], ..Shading::default() }
 }
 
-/// A number of rays or rounds, twenty times as many in the long form.
+/// A number of rays or rounds, as many times as `TERRAFARM_LONG` says.
 pub(crate) fn count(short: u64) -> u64 {
-    if std::env::var_os("TERRAFARM_LONG").is_some_and(|value| value != "0") {
-        20 * short
-    } else {
-        short
-    }
+    let times = std::env::var("TERRAFARM_LONG").ok();
+    short * times.map_or(1, |times| times.parse().expect("TERRAFARM_LONG is a number of times"))
 }
 
 /// Terrains of every sort, most with posts at whole metres.
