@@ -471,11 +471,22 @@ fn text(report: &Report, means: &[Point]) -> String {
     };
     text.push_str(&format!("on the Pareto front with some setting: {}\n", named(false)));
     text.push_str(&format!("dominated with every setting: {}\n", named(true)));
+    // Mostly it is not the setting that is refused.
+    let mut refusals: Vec<(&Refused, Vec<&str>)> = Vec::new();
     for refused in &report.refused {
-        text.push_str(&format!(
-            "{} at {} refused {} over {}: {}\n",
-            refused.method, refused.setting, refused.camera, refused.terrain, refused.why
-        ));
+        let alike = |other: &Refused| {
+            let parts =
+                |r: &Refused| (r.method, r.camera.clone(), r.terrain.clone(), r.why.clone());
+            parts(other) == parts(refused)
+        };
+        match refusals.iter_mut().find(|(other, _)| alike(other)) {
+            Some((_, settings)) => settings.push(&refused.setting),
+            None => refusals.push((refused, vec![&refused.setting])),
+        }
+    }
+    for (Refused { method, camera, terrain, why, .. }, settings) in refusals {
+        let settings = settings.join(", ");
+        text.push_str(&format!("{method} at {settings} refused {camera} over {terrain}: {why}\n"));
     }
     text
 }
