@@ -20,6 +20,7 @@
 mod abreast;
 mod arc;
 mod many;
+mod nearby;
 mod rays;
 mod tiles;
 mod window;

@@ -161,6 +161,22 @@ pub(crate) trait Ints:
     /// rows and an element, or these less than eight elements or 2^15 and more.
     fn gather_around(table: &[u16], at: Self, stride: usize, mask: Self::M) -> [Self; 6];
 
+    /// Whether lanes pick from vectors: [`Ints::pick_pairs`] then is far quicker than a gather.
+    const PICKS: bool = false;
+
+    /// For each lane the elements `at` (low half) and `at + 1` (high half) of a square of eight
+    /// by eight; any, if these are not in it.
+    #[inline(always)]
+    fn pick_pairs(square: &[u16; 64], at: Self) -> Self {
+        let mut places = [0; MOST];
+        at.store(&mut places);
+        for place in &mut places {
+            let (low, high) = (*place as usize % 64, (*place as usize).wrapping_add(1) % 64);
+            *place = i32::from(square[low]) | i32::from(square[high]) << 16;
+        }
+        Self::load(&places)
+    }
+
     /// The corner of the square, eight rows of eight elements of a table, that has the places
     /// from `low` to `high` of all lanes in `mask`, at most `limit`; and whether there is one:
     /// never at widths whose lanes do not pick from vectors. Places are columns, and from bit 16
@@ -461,6 +477,34 @@ mod tests {
             let bits = next(0xFFFF) as u32;
             for width in Width::available() {
                 run(Picks { posts: &posts, stride, places, bits }, width);
+            }
+        }
+    }
+
+    struct Squares([u16; 64], [i32; MOST]);
+
+    impl Kernel for Squares {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Lanes>(self) {
+            let Squares(square, places) = self;
+            let mut pairs = [0; MOST];
+            L::I::pick_pairs(&square, L::I::load(&places)).store(&mut pairs);
+            for lane in 0..L::N {
+                let [low, high] = [0, 1].map(|n| u32::from(square[places[lane] as usize + n]));
+                assert_eq!(pairs[lane] as u32, high << 16 | low);
+            }
+        }
+    }
+
+    #[test]
+    fn pairs_picked_out_of_a_square_are_neighbours_in_it() {
+        let square = std::array::from_fn(|n| (n as u16).wrapping_mul(40_503));
+        for first in 0..=62 {
+            let places = std::array::from_fn(|lane| (first + 13 * lane as i32) % 63);
+            for width in Width::available() {
+                run(Squares(square, places), width);
             }
         }
     }

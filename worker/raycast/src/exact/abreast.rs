@@ -58,8 +58,9 @@ const CELLS_FIRST: u32 = 8;
 const LONG: u32 = CELLS_FIRST + 10;
 /// One lane of so many, or fewer, are few.
 const FEW: usize = 5;
-/// Rays that are aimed before any of them is stepped: few enough for the nearest cache.
-const BATCH: usize = 256;
+/// Vectors of rays that are aimed before any of them is stepped: few enough for the nearest
+/// cache.
+const FLEET: usize = 16;
 
 /// What all rays have in common.
 #[derive(Clone, Copy)]
@@ -144,27 +145,32 @@ impl Abreast<'_, '_> {
         self.rest.count = 0;
         let count = self.rays.count;
         let mut steps = 0;
-        let mut fleet: Vec<(usize, Approach<L>)> = Vec::with_capacity(BATCH / L::N);
-        let mut under_way = [0; BATCH];
+        let mut fleet = [Approach::<L>::none(); FLEET];
+        let mut under_way = [0; FLEET];
         let mut from = 0;
         while from < count {
-            let to = count.min(from + BATCH);
-            fleet.clear();
+            let to = count.min(from + FLEET * L::N);
             let mut left = 0;
-            let mut at = from;
-            while at < to {
+            for n in 0..FLEET {
+                let at = from + n * L::N;
+                if at >= to {
+                    break;
+                }
                 let lanes = lanes_up_to::<L>(to - at);
                 let free = self.load::<L>(Part::Depth, at);
                 if (lanes & free.lt(L::D::splat(f64::INFINITY))).any() {
-                    let mut approach = self.aim_at::<L, ROUND>(at, lanes);
+                    let approach = &mut fleet[n];
+                    self.aim_at::<L, ROUND>(at, lanes, approach);
                     approach.glide(&self.sight, self.tiles);
-                    under_way[left] = fleet.len();
-                    left += usize::from(approach.active.any());
-                    fleet.push((at, approach));
+                    if approach.active.any() {
+                        approach.reach_nearby(self.tiles);
+                        under_way[left] = n;
+                        left += 1;
+                    }
                 } else {
                     L::I::splat(Verdict::Miss as i32).store(&mut self.rays.verdicts[at..]);
+                    L::D::splat(f64::NEG_INFINITY).store(&mut self.rays.part_mut(Part::Last)[at..]);
                 }
-                at += L::N;
             }
             let mut turn = 0;
             while left > 0 {
@@ -172,7 +178,7 @@ impl Abreast<'_, '_> {
                 let mut kept = 0;
                 for n in 0..left {
                     let number = under_way[n];
-                    let (_, approach) = &mut fleet[number];
+                    let approach = &mut fleet[number];
                     steps += if turn < CELLS_FIRST {
                         approach.step_cells(self.tiles)
                     } else {
@@ -184,8 +190,11 @@ impl Abreast<'_, '_> {
                 left = kept;
                 turn += 1;
             }
-            for (at, approach) in &fleet {
-                self.touch_at::<L, ROUND>(*at, approach.cell, lanes_up_to::<L>(to - at));
+            for (n, approach) in fleet.iter().enumerate() {
+                let at = from + n * L::N;
+                if at < to {
+                    self.touch_at::<L, ROUND>(at, approach, lanes_up_to::<L>(to - at));
+                }
             }
             from = to;
         }
@@ -215,7 +224,12 @@ impl Abreast<'_, '_> {
     }
 
     #[inline(always)]
-    fn aim_at<L: Lanes, const ROUND: bool>(&mut self, at: usize, lanes: L::M) -> Approach<L> {
+    fn aim_at<L: Lanes, const ROUND: bool>(
+        &mut self,
+        at: usize,
+        lanes: L::M,
+        approach: &mut Approach<L>,
+    ) {
         let sight = self.sight;
         let ([x, y, up], free) = self.directions::<L>(at);
         let across = x * x + y * y;
@@ -292,16 +306,19 @@ impl Abreast<'_, '_> {
             (L::I::splat(Verdict::Open as i32), L::I::splat(Verdict::Miss as i32));
         L::I::select(open, open_code, miss).store(&mut self.rays.verdicts[at..]);
         let start = Start { begin, last, rate, inverse, z, fall };
-        let mut approach = Approach::new(&sight, &start);
-        approach.active = approach.active & lanes;
-        approach
+        approach.begin(&sight, &start, lanes);
     }
 
     /// Tests the cells in which the approaches have ended; rays that meet nothing there are
     /// left for the walk.
     #[inline(always)]
-    fn touch_at<L: Lanes, const ROUND: bool>(&mut self, at: usize, cell: [L::I; 2], lanes: L::M) {
-        let sight = self.sight;
+    fn touch_at<L: Lanes, const ROUND: bool>(
+        &mut self,
+        at: usize,
+        approach: &Approach<L>,
+        lanes: L::M,
+    ) {
+        let (sight, cell) = (self.sight, approach.cell());
         let mut walk = Walk::<L>::new();
         walk.load::<ROUND>(self.rays, at, cell);
         let begin = self.load::<L>(Part::U, at);
@@ -311,7 +328,10 @@ impl Abreast<'_, '_> {
         }
         let u = begin.max(walk.entry(&sight));
         let near = lanes & u.lt(walk.last);
-        let (hits, absent, hit_u, hit_z) = walk.contacts::<ROUND>(&sight, self.tiles, near);
+        let (hits, absent, hit_u, hit_z) = {
+            let held = approach.nearby.corners(cell, near);
+            walk.contacts::<ROUND>(&sight, self.tiles, near, held)
+        };
         let left = lanes & !hits;
         self.store::<L>(Part::U, at, L::D::select(hits, hit_u, L::D::select(near, u, begin)));
         self.store::<L>(Part::Z, at, hit_z);
@@ -428,7 +448,7 @@ impl Abreast<'_, '_> {
         let blocks = walk.active & !cells;
         let exits = walk.exits::<ROUND>(&self.sight);
         if cells.count() >= blocks.count() {
-            let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells);
+            let (hits, absent, u, z) = walk.contacts::<ROUND>(&self.sight, self.tiles, cells, None);
             if hits.any() {
                 self.keep_hits(walk, hits, u, z);
             }

@@ -83,6 +83,12 @@ impl<L: Lanes> Rough<L> {
     #[inline(always)]
     fn of_codes(codes: &Codes, at: L::I, lanes: L::M) -> Self {
         let (read, solid) = read_pairs::<L>(codes, at, lanes);
+        Rough::of_read(read, codes.base, codes.step, solid)
+    }
+
+    /// Cells the codes of whose corners are given, and the base and the step of these.
+    #[inline(always)]
+    pub(super) fn of_read(read: [L::I; 4], base: i32, step: f64, solid: L::M) -> Self {
         Rough {
             heights: [
                 read[0].to_floats(),
@@ -90,8 +96,8 @@ impl<L: Lanes> Rough<L> {
                 read[2].to_floats(),
                 read[3].to_floats(),
             ],
-            scale: L::F::splat(codes.step as f32),
-            base: L::F::splat((f64::from(codes.base) * codes.step) as f32),
+            scale: L::F::splat(step as f32),
+            base: L::F::splat((f64::from(base) * step) as f32),
             solid,
             ..Rough::none()
         }
@@ -182,6 +188,20 @@ impl<'a> Tiles<'a> {
         lanes & numbers.eq(L::I::splat(self.last.0))
     }
 
+    /// Whether `lanes` are over one tile, which then is `last`.
+    #[inline(always)]
+    pub(super) fn has_all<L: Lanes>(&mut self, cell: [L::I; 2], lanes: L::M) -> bool {
+        let numbers = self.numbers::<L>(cell);
+        self.alike::<L>(numbers, lanes).bits() == lanes.bits()
+    }
+
+    /// The cell in the south-west of `last`.
+    #[inline(always)]
+    pub(super) fn first_cell(&self) -> [i32; 2] {
+        let columns = self.columns.max(1);
+        [self.last.0 % columns, self.last.0 / columns].map(|tile| tile << MAXIMA_LEVELS)
+    }
+
     /// Maxima over blocks of `1 << level` cells, metres, for `lanes`: -infinity where no
     /// cell has a surface, that of the whole tile where it is not loaded. Also these lanes.
     #[inline(always)]
@@ -202,7 +222,8 @@ impl<'a> Tiles<'a> {
                 Soil::Codes(codes) => {
                     let code = L::I::gather_pairs(codes.maxima, at, here) & L::I::splat(0xFFFF);
                     let any = here & !code.eq(L::I::splat(0));
-                    highest = L::D::select(any, heights::<L>(&codes, code), highest);
+                    highest =
+                        L::D::select(any, heights::<L>(codes.base, codes.step, code), highest);
                 }
                 Soil::Floats { maxima, .. } => {
                     highest = L::D::select(here, read_float::<L>(maxima, at, here), highest);
@@ -300,7 +321,7 @@ impl<'a> Tiles<'a> {
                     let (read, solid) = read_pairs::<L>(&codes, at, here);
                     corners.solid = corners.solid | solid;
                     for n in 0..4 {
-                        let height = heights::<L>(&codes, read[n]);
+                        let height = heights::<L>(codes.base, codes.step, read[n]);
                         corners.heights[n] = L::D::select(here, height, corners.heights[n]);
                     }
                 }
@@ -348,9 +369,9 @@ fn rough_heights<L: Lanes>(codes: &Codes, code: L::I) -> L::F {
 
 /// Heights of codes, metres: what the tile gives back for each, to the bit.
 #[inline(always)]
-fn heights<L: Lanes>(codes: &Codes, code: L::I) -> L::D {
-    let steps = L::D::from_ints(L::I::splat(codes.base) + code);
-    (steps * L::D::splat(codes.step)).to_single()
+pub(super) fn heights<L: Lanes>(base: i32, step: f64, code: L::I) -> L::D {
+    let steps = L::D::from_ints(L::I::splat(base) + code);
+    (steps * L::D::splat(step)).to_single()
 }
 
 #[inline(always)]

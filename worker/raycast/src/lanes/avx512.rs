@@ -304,6 +304,12 @@ impl Ints for I {
         }
     }
 
+    const PICKS: bool = true;
+    #[inline(always)]
+    fn pick_pairs(square: &[u16; 64], at: I) -> I {
+        // SAFETY: see the page of this module.
+        unsafe { square::pairs(square, at) }
+    }
     #[inline(always)]
     fn corner(low: I, high: I, limit: i32, mask: M) -> (i32, bool) {
         // SAFETY: see the page of this module.

@@ -48,6 +48,7 @@
 
 use super::walk::cell_at;
 use super::{Sight, Start};
+use crate::exact::nearby::{Nearby, Places};
 use crate::exact::tiles::{Rough, Tiles};
 use crate::exact::{CLEARANCE_M, FIRST_LEVEL};
 use crate::lanes::{Doubles, Floats, Ints, Lanes, Mask};
@@ -66,12 +67,12 @@ const ROUGHNESS: f64 = 1.0 / (1 << 18) as f64;
 const STEEPEST: f32 = 1e30;
 
 /// Lanes on their way.
+#[derive(Clone, Copy)]
 pub(super) struct Approach<L: Lanes> {
     pub(super) active: L::M,
     /// The cell in which the ray began.
     pub(super) base: [L::I; 2],
-    pub(super) cell: [L::I; 2],
-    /// The same from `base` on.
+    /// The cell that it is in, from `base` on.
     pub(super) place: [L::F; 2],
     /// Of the block that is looked at, once blocks are.
     level: L::I,
@@ -84,6 +85,8 @@ pub(super) struct Approach<L: Lanes> {
     pub(super) from: [L::F; 2],
     pub(super) rate: [L::F; 2],
     pub(super) inverse: [L::F; 2],
+    /// From a cell to the next along an axis: 1 or -1.
+    stride: [L::F; 2],
     /// 1 along an axis on which the index of the cell grows, else 0 ...
     pub(super) ahead: [L::I; 2],
     /// ... and the way from `from` to the line ahead of the first cell.
@@ -99,6 +102,7 @@ pub(super) struct Approach<L: Lanes> {
     height: L::F,
     pub(super) slope: L::F,
     pub(super) reach: L::F,
+    pub(super) nearby: Nearby<L>,
 }
 
 /// Where lanes leave their blocks.
@@ -112,44 +116,52 @@ struct Exits<L: Lanes> {
 }
 
 impl<L: Lanes> Approach<L> {
-    /// Rays at the start of their approach.
+    /// Nothing under way.
     #[inline(always)]
-    pub(super) fn new(sight: &Sight, start: &Start<L>) -> Self {
-        let Start { begin, last, rate, inverse, z, fall } = *start;
-        let along = inverse[0].abs().min(inverse[1].abs());
-        let pace = rate[0].abs().max(rate[1].abs());
-        let slope = (fall * along).to_floats();
-        let reach = ((last - begin) * pace).min(L::D::splat(FARTHEST)).to_floats();
-        let may = begin.lt(last) & slope.abs().lt(L::F::splat(STEEPEST));
-        let sure = sight.slack[0].max(sight.slack[1]) < SURE_SLACK;
-        let active = if sure { may } else { L::M::none() };
-        let size = z.abs() + L::D::splat(sight.largest);
-        let room = L::D::splat(CLEARANCE_M) + L::D::splat(ROUGHNESS) * size;
-        let low = (z - room).to_floats();
-        let (none, zero) = (L::F::splat(0.0), L::I::splat(0));
-        let blur = L::F::splat(BLUR);
-        let mut approach = Approach::<L> {
-            active,
+    pub(super) fn none() -> Self {
+        let (none, zero, lanes) = (L::F::splat(0.0), L::I::splat(0), L::M::none());
+        Approach {
+            active: lanes,
             base: [zero; 2],
-            cell: [zero; 2],
             place: [none; 2],
-            level: L::I::splat(FIRST_LEVEL as i32),
+            level: zero,
             v: none,
             gap: none,
-            fresh: active,
+            fresh: lanes,
             from: [none; 2],
             rate: [none; 2],
             inverse: [none; 2],
+            stride: [none; 2],
             ahead: [zero; 2],
             toward: [none; 2],
             doubt: [none; 2],
             blur: none,
             tie: none,
             turn: none,
-            height: low,
-            slope,
-            reach,
-        };
+            height: none,
+            slope: none,
+            reach: none,
+            nearby: Nearby::none(),
+        }
+    }
+
+    /// Puts rays at the start of their approach.
+    #[inline(always)]
+    pub(super) fn begin(&mut self, sight: &Sight, start: &Start<L>, lanes: L::M) {
+        let Start { begin, last, rate, inverse, z, fall } = *start;
+        let along = inverse[0].abs().min(inverse[1].abs());
+        let pace = rate[0].abs().max(rate[1].abs());
+        let slope = (fall * along).to_floats();
+        let reach = ((last - begin) * pace).min(L::D::splat(FARTHEST)).to_floats();
+        let may = lanes & begin.lt(last) & slope.abs().lt(L::F::splat(STEEPEST));
+        let sure = sight.slack[0].max(sight.slack[1]) < SURE_SLACK;
+        self.active = if sure { may } else { L::M::none() };
+        self.fresh = self.active;
+        self.level = L::I::splat(FIRST_LEVEL as i32);
+        let size = z.abs() + L::D::splat(sight.largest);
+        let room = L::D::splat(CLEARANCE_M) + L::D::splat(ROUGHNESS) * size;
+        let low = (z - room).to_floats();
+        let blur = L::F::splat(BLUR);
         for axis in 0..2 {
             let position = L::D::splat(sight.start[axis]) + begin * rate[axis];
             let slack = L::D::splat(sight.slack[axis]);
@@ -158,23 +170,26 @@ impl<L: Lanes> Approach<L> {
             let cell = cell_at::<L>(position, slack, ahead, last);
             let inverse = (inverse[axis] * pace).to_floats();
             let from = (position - L::D::from_ints(cell)).to_floats();
-            approach.base[axis] = cell;
-            approach.cell[axis] = cell;
-            approach.from[axis] = from;
-            approach.rate[axis] = (rate[axis] * along).to_floats();
-            approach.inverse[axis] = inverse;
-            approach.ahead[axis] = L::I::select(ahead, L::I::splat(1), zero);
-            let line: L::F = approach.ahead[axis].to_floats();
-            approach.toward[axis] = line - from;
-            approach.doubt[axis] = blur * (L::F::splat(1.0) + inverse.abs());
+            self.base[axis] = cell;
+            self.place[axis] = L::F::splat(0.0);
+            self.from[axis] = from;
+            self.rate[axis] = (rate[axis] * along).to_floats();
+            self.inverse[axis] = inverse;
+            self.ahead[axis] = L::I::select(ahead, L::I::splat(1), L::I::splat(0));
+            let line: L::F = self.ahead[axis].to_floats();
+            self.stride[axis] = line + line - L::F::splat(1.0);
+            self.toward[axis] = line - from;
+            self.doubt[axis] = blur * (L::F::splat(1.0) + inverse.abs());
         }
-        let doubt = approach.doubt[0].max(approach.doubt[1]);
-        approach.blur = L::F::splat(8.0) * doubt;
-        approach.tie = approach.doubt[0] + approach.doubt[1];
-        approach.reach = reach - approach.tie;
-        approach.height = low - doubt * slope.abs();
-        approach.turn = L::F::splat(-0.25) * approach.rate[0] * approach.rate[1];
-        approach
+        let doubt = self.doubt[0].max(self.doubt[1]);
+        self.v = L::F::splat(0.0);
+        self.blur = L::F::splat(8.0) * doubt;
+        self.tie = self.doubt[0] + self.doubt[1];
+        self.reach = reach - self.tie;
+        self.slope = slope;
+        self.height = low - doubt * slope.abs();
+        self.turn = L::F::splat(-0.25) * self.rate[0] * self.rate[1];
+        self.nearby.forget();
     }
 
     /// Where the rays cross lines, by how far these are from the lines ahead of the first
@@ -198,27 +213,43 @@ impl<L: Lanes> Approach<L> {
     pub(super) fn step_cells(&mut self, tiles: &mut Tiles) -> u64 {
         let taken = self.active;
         let exits = self.exits(self.place);
-        let rough = tiles.rough_corners::<L>(self.cell, taken);
-        let clear = (self.misses(&rough, &exits, self.fresh) | !rough.solid) & !rough.absent;
+        let (clear, solid) = if self.reach_nearby(tiles) {
+            let rough = self.nearby.rough(self.place, taken);
+            (self.misses(&rough, &exits, self.fresh) | !rough.solid, rough.solid)
+        } else {
+            let rough = tiles.rough_corners::<L>(self.cell(), taken);
+            let missed = self.misses(&rough, &exits, self.fresh);
+            ((missed | !rough.solid) & !rough.absent, rough.solid)
+        };
         let [x, y] = exits.lines;
         let sure = self.tie.lt(x.max(y) - exits.v);
         let moving = taken & clear & sure & exits.v.lt(self.reach);
         self.go(0, moving & !exits.north);
         self.go(1, moving & exits.north);
         self.v = exits.v;
-        self.fresh = moving & !rough.solid;
+        self.fresh = moving & !solid;
         self.active = moving;
         u64::from(taken.count())
+    }
+
+    /// Sees to it that the posts around the cells are at hand, if they can be.
+    #[inline(always)]
+    pub(super) fn reach_nearby(&mut self, tiles: &mut Tiles) -> bool {
+        let at = Places { base: self.base, place: self.place, ahead: self.ahead };
+        self.nearby.reach(tiles, &at, self.active)
     }
 
     /// Goes on to the next cell along an axis.
     #[inline(always)]
     fn go(&mut self, axis: usize, lanes: L::M) {
-        let one = L::I::splat(1);
-        let ahead = self.ahead[axis];
-        let cell = self.cell[axis] + (ahead + ahead - one);
-        self.cell[axis] = L::I::select(lanes, cell, self.cell[axis]);
-        self.place[axis] = (self.cell[axis] - self.base[axis]).to_floats();
+        let next = self.place[axis] + self.stride[axis];
+        self.place[axis] = L::F::select(lanes, next, self.place[axis]);
+    }
+
+    /// The cells that the rays are in.
+    #[inline(always)]
+    pub(super) fn cell(&self) -> [L::I; 2] {
+        [self.base[0] + self.place[0].truncate(), self.base[1] + self.place[1].truncate()]
     }
 
     /// Takes lanes, at blocks and cells, a step further. Returns how many.
@@ -228,13 +259,14 @@ impl<L: Lanes> Approach<L> {
         let taken = self.active;
         let cells = taken & self.level.eq(zero);
         let blocks = taken & !cells;
+        let before = self.cell();
         let lines = [
-            (self.cell[0].shr(self.level) + self.ahead[0]).shl(self.level) - self.ahead[0],
-            (self.cell[1].shr(self.level) + self.ahead[1]).shl(self.level) - self.ahead[1],
+            (before[0].shr(self.level) + self.ahead[0]).shl(self.level) - self.ahead[0],
+            (before[1].shr(self.level) + self.ahead[1]).shl(self.level) - self.ahead[1],
         ];
         let exits = self
             .exits([(lines[0] - self.base[0]).to_floats(), (lines[1] - self.base[1]).to_floats()]);
-        let rough = tiles.rough::<L>(self.cell, self.level, blocks, cells);
+        let rough = tiles.rough::<L>(before, self.level, blocks, cells);
         let passed = rough.highest.lt(self.low(self.v).min(exits.low));
         let mut clear = blocks & passed & !rough.absent;
         if cells.any() {
@@ -243,11 +275,10 @@ impl<L: Lanes> Approach<L> {
         }
         let down = blocks & !clear & !rough.absent;
         self.level = L::I::select(down, self.level - one, self.level);
-        let before = self.cell;
         let moved = self.pass(sight, lines, &exits, clear);
-        let parent = self.level + one;
-        let same_x = before[0].shr(parent).eq(self.cell[0].shr(parent));
-        let same_y = before[1].shr(parent).eq(self.cell[1].shr(parent));
+        let (after, parent) = (self.cell(), self.level + one);
+        let same_x = before[0].shr(parent).eq(after[0].shr(parent));
+        let same_y = before[1].shr(parent).eq(after[1].shr(parent));
         let up = moved & !(same_x & same_y) & self.level.lt(L::I::splat(MAXIMA_LEVELS as i32));
         self.level = L::I::select(up, parent, self.level);
         self.active = down | moved;
@@ -304,13 +335,13 @@ impl<L: Lanes> Approach<L> {
         let doubt = L::F::select(north, self.doubt[1], self.doubt[0]);
         let sure = doubt.lt(part) & part.lt(L::F::splat(1.0) - doubt);
         let near = exits.v.lt(self.reach);
-        let beside = floor + L::I::select(north, self.base[0], self.base[1]);
+        let after = after - L::I::select(north, self.base[1], self.base[0]);
+        let (after, beside): (L::F, L::F) = (after.to_floats(), floor.to_floats());
         let moving = lanes & sure & near & !outside;
         self.v = L::F::select(moving, exits.v, self.v);
-        self.cell[0] = L::I::select(moving, L::I::select(north, beside, after), self.cell[0]);
-        self.cell[1] = L::I::select(moving, L::I::select(north, after, beside), self.cell[1]);
+        let places = [L::F::select(north, beside, after), L::F::select(north, after, beside)];
         for axis in 0..2 {
-            self.place[axis] = (self.cell[axis] - self.base[axis]).to_floats();
+            self.place[axis] = L::F::select(moving, places[axis], self.place[axis]);
         }
         moving
     }

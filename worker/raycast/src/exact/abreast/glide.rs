@@ -53,10 +53,10 @@ impl<L: Lanes> Approach<L> {
     fn glide_over_window(&mut self, tiles: &mut Tiles, lanes: L::M) -> L::M {
         let bits = lanes.bits();
         let (first, last) = (bits.trailing_zeros(), 31 - bits.leading_zeros());
-        let mut corner = [0; 2];
+        let (mut corner, cell) = ([0; 2], self.cell());
         for axis in 0..2 {
             let (mut cells, mut ahead) = ([0; MOST], [0; MOST]);
-            self.cell[axis].store(&mut cells);
+            cell[axis].store(&mut cells);
             self.ahead[axis].store(&mut ahead);
             let (first, last) = (first as usize % MOST, last as usize % MOST);
             corner[axis] = if ahead[first] == 1 {
@@ -75,7 +75,7 @@ impl<L: Lanes> Approach<L> {
         let mut rise = L::F::splat(0.0);
         for axis in 0..2 {
             let first = L::I::splat(plane.first[axis]);
-            let cell = self.cell[axis] - first;
+            let cell = cell[axis] - first;
             inside = inside & !cell.lt(zero) & cell.lt(side);
             // From the window's south-west post to where the ray began.
             let from = (self.base[axis] - first).to_floats() + self.from[axis];
@@ -92,18 +92,16 @@ impl<L: Lanes> Approach<L> {
         let v = L::F::select(falls, down.min(end), end);
         let clear = L::F::splat(0.0).lt(above) & (height + rise * v).lt(self.low(v));
         let mut moving = inside & clear & self.v.lt(v);
-        let mut cells = self.cell;
+        let mut places = self.place;
         for axis in 0..2 {
             let place = self.from[axis] + v * self.rate[axis];
-            let floor = place.floor();
-            let part = place - floor.to_floats();
+            places[axis] = place.floor().to_floats();
+            let part = place - places[axis];
             moving = moving & blur.lt(part) & part.lt(most);
-            cells[axis] = self.base[axis] + floor;
         }
         self.v = L::F::select(moving, v, self.v);
         for axis in 0..2 {
-            self.cell[axis] = L::I::select(moving, cells[axis], self.cell[axis]);
-            self.place[axis] = (self.cell[axis] - self.base[axis]).to_floats();
+            self.place[axis] = L::F::select(moving, places[axis], self.place[axis]);
         }
         moving & end.le(v)
     }

@@ -3,7 +3,7 @@
 use super::Sight;
 use crate::exact::arc::{Rise, Spans};
 use crate::exact::rays::{Part, Rays};
-use crate::exact::tiles::Tiles;
+use crate::exact::tiles::{Corners, Tiles};
 use crate::exact::{CLEARANCE_M, FIRST_LEVEL};
 use crate::lanes::{Doubles, Ints, Lanes, MOST, Mask};
 use terrafarm_terrain::tile::MAXIMA_LEVELS;
@@ -293,9 +293,13 @@ impl<L: Lanes> Walk<L> {
         sight: &Sight,
         tiles: &mut Tiles,
         lanes: L::M,
+        held: Option<Corners<L>>,
     ) -> (L::M, L::M, L::D, L::D) {
         let (zero, one) = (L::D::splat(0.0), L::D::splat(1.0));
-        let corners = tiles.corners::<L>(self.cell, lanes);
+        let corners = match held {
+            Some(corners) => corners,
+            None => tiles.corners::<L>(self.cell, lanes),
+        };
         let [sw, se, nw, ne] = corners.heights;
         let [x, y] = self.ahead;
         let ahead = [!x.eq(L::I::splat(0)), !y.eq(L::I::splat(0))];

@@ -7,6 +7,22 @@
 use super::{I, M};
 use std::arch::x86_64::*;
 
+/// See [`super::Ints::pick_pairs`].
+///
+/// # Safety
+/// As every block of the parent.
+#[inline(always)]
+pub(super) unsafe fn pairs(square: &[u16; 64], at: I) -> I {
+    // SAFETY: by this function's own condition; the halves of the square are in it.
+    unsafe {
+        let south = _mm512_loadu_si512(square.as_ptr().cast());
+        let north = _mm512_loadu_si512(square[32..].as_ptr().cast());
+        let both = _mm512_or_si512(at.0, _mm512_slli_epi32::<16>(at.0));
+        let at = _mm512_add_epi16(both, _mm512_set1_epi32(1 << 16));
+        I(_mm512_permutex2var_epi16(south, at, north))
+    }
+}
+
 /// See [`super::Ints::corner`].
 ///
 /// # Safety
