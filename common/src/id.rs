@@ -37,6 +37,10 @@ number_id!(
 /// Index of a frame within its shot, from 0.
 pub type FrameIndex = u32;
 
+/// The most frames of one shot: twelve hours at 24 a second. A longer flight is rendered in
+/// parts.
+pub const MAX_SHOT_FRAMES: u32 = 1 << 20;
+
 /// SHA-256 of a blob: the identity of a terrain tile or of a store's index.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct BlobHash(pub [u8; 32]);

@@ -53,6 +53,11 @@ pub enum Split {
     Tiles(u32),
 }
 
+impl Split {
+    /// The longest side of a tile, pixels: its result is 12 MiB on the wire.
+    pub const MAX_TILE_SIDE: u32 = 2048;
+}
+
 /// Cuts a frame into columns at the given x positions.
 ///
 /// `cuts` are interior positions in ascending order; each region has full height.

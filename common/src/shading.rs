@@ -5,6 +5,7 @@
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 
 /// Linear-light RGB, 0 to 1.
 pub type LinearRgb = [f32; 3];
@@ -94,6 +95,12 @@ pub struct Earth {
 }
 
 impl Earth {
+    /// Radii that are taken, metres: from small moons to far beyond planets.
+    pub const RADII_M: RangeInclusive<f64> = 1e5..=1e8;
+    /// Coefficients of refraction that are taken: beyond, rays bend more than air ever does,
+    /// and at 1 they would follow the ground.
+    pub const REFRACTIONS: RangeInclusive<f64> = -1.0..=0.9;
+
     /// R / (1 - k), metres.
     pub fn effective_radius_m(&self) -> f64 {
         self.radius_m / (1.0 - self.refraction)

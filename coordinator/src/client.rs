@@ -9,18 +9,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use terrafarm_common::accuracy::{Share, Summary};
 use terrafarm_common::camera::Camera;
-use terrafarm_common::id::{BlobHash, FrameIndex, ShotId};
+use terrafarm_common::id::{BlobHash, FrameIndex, MAX_SHOT_FRAMES, ShotId};
 use terrafarm_common::image::Rgb8;
 use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::StoreReader;
-use terrafarm_wire::limits::{CAMERAS_MAX, clip_name, clip_reason};
+use terrafarm_wire::limits::{CAMERAS_MAX, NEWEST_VERSION, clip_name, clip_reason};
 use terrafarm_wire::link::{self, HandshakeError, LinkError, Outbox, Trust, Unsent};
 use terrafarm_wire::message::{
     Blob, Cameras, Cancel, Frame, FrameTaken, Goodbye, Message, NoBlob, Ping, Pong, Progress, Role,
     ShotDone, Submit, WantBlobs,
 };
+use terrafarm_wire::{WireError, encode};
 use tokio::sync::mpsc::{self, error::TrySendError};
 use tokio_util::sync::CancellationToken;
 
@@ -104,6 +105,9 @@ pub enum ClientError {
     /// The connection was lost.
     #[error("the coordinator was lost: {0}; frames that have come are kept")]
     Link(#[from] LinkError),
+    /// No farm would take the shot: it was not sent.
+    #[error("the shot fits no farm: {0}")]
+    Unfit(String),
     /// The farm does not take the shot, or gave it up.
     #[error("the farm refused the shot: {0}")]
     Refused(String),
@@ -136,8 +140,8 @@ impl Coordinator {
 /// is lost is tried again, and gets what is still missing.
 ///
 /// # Errors
-/// If there is no coordinator, it refuses, it stays away for longer than is waited, or
-/// `stop` is cancelled.
+/// If the shot fits no farm, there is no coordinator, it refuses, it stays away for longer
+/// than is waited, or `stop` is cancelled.
 pub async fn render(
     coordinator: &Coordinator,
     submission: Submission,
@@ -146,6 +150,7 @@ pub async fn render(
     stop: CancellationToken,
 ) -> Result<ShotDone, ClientError> {
     let began = Instant::now();
+    submission.check()?;
     let mut errand = Errand {
         missing: (0..submission.cameras.len() as FrameIndex).collect(),
         frames_done: 0,
@@ -197,7 +202,7 @@ impl ClientError {
                 // Somebody answered, but died at it; a token that was right stays right.
                 _ => true,
             },
-            ClientError::Refused(_) | ClientError::Stopped => false,
+            ClientError::Unfit(_) | ClientError::Refused(_) | ClientError::Stopped => false,
         }
     }
 }
@@ -229,7 +234,7 @@ impl Errand {
         let silence = Duration::from_micros(welcome.silence_us);
         let (mut reader, writer) = connection.split();
         let (outbox, queues) = link::outbox(URGENT_QUEUE, BULK_QUEUE);
-        let writing = tokio::spawn(writer.run(queues));
+        let mut writing = tokio::spawn(writer.run(queues));
         let (wants, wanted) = mpsc::channel(WANTS_QUEUE);
         let store = self.submission.store.clone();
         let serving = tokio::spawn(serve_blobs(store, wanted, outbox.clone()));
@@ -294,13 +299,18 @@ impl Errand {
                     Ok(None) => break Err(LinkError::Closed.into()),
                     Err(why) => break Err(why.into()),
                 },
+                written = &mut writing => break Err(match written {
+                    Ok(Err(LinkError::Wire(why))) => ClientError::Unfit(why.to_string()),
+                    Ok(Err(why)) => why.into(),
+                    Ok(Ok(())) | Err(_) => LinkError::Closed.into(),
+                }),
             }
         };
         submitting.abort();
         serving.abort();
         let stuck = writing.abort_handle();
         // On a link that is dead, what waits to be sent would wait for ever.
-        if !matches!(result, Err(ClientError::Link(_))) {
+        if !matches!(result, Err(ClientError::Link(_) | ClientError::Unfit(_))) {
             let farewell = async {
                 let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
                 drop(outbox);
@@ -421,12 +431,36 @@ struct Plan {
 }
 
 impl Submission {
+    /// Refuses what the encoder would refuse, before anybody is bothered with it.
+    fn check(&self) -> Result<(), ClientError> {
+        let frames = self.cameras.len();
+        if frames > MAX_SHOT_FRAMES as usize {
+            return Err(ClientError::Unfit(format!(
+                "{frames} frames; one shot has {MAX_SHOT_FRAMES} at most, so render it in parts, \
+                 each some of the frames"
+            )));
+        }
+        let unfit = |why: WireError| ClientError::Unfit(why.to_string());
+        encode(NEWEST_VERSION, &self.submit(frames as u32).into()).map_err(unfit)?;
+        for cameras in self.cameras.chunks(CAMERAS_MAX) {
+            let piece = Cameras { number: NUMBER, first: 0, cameras: cameras.to_vec() };
+            encode(NEWEST_VERSION, &piece.into()).map_err(unfit)?;
+        }
+        Ok(())
+    }
+
     /// A plan of these frames.
     fn plan(&self, frames: &[FrameIndex]) -> Plan {
+        let cameras = frames.iter().map(|&frame| self.cameras[frame as usize]).collect();
+        Plan { submit: self.submit(frames.len() as u32), cameras }
+    }
+
+    /// The message that submits so many frames.
+    fn submit(&self, frames: u32) -> Submit {
         let (index, _) = self.store.index_blob();
         let (width, height) =
             self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
-        let submit = Submit {
+        Submit {
             number: NUMBER,
             name: clip_name(&self.name),
             index,
@@ -436,13 +470,11 @@ impl Submission {
             width,
             height,
             split: self.split,
-            frames: frames.len() as u32,
+            frames,
             frames_in_flight: self.frames_in_flight,
             priority: self.priority,
             live: self.live,
-        };
-        let cameras = frames.iter().map(|&frame| self.cameras[frame as usize]).collect();
-        Plan { submit, cameras }
+        }
     }
 }
 

@@ -144,7 +144,7 @@ pub async fn serve(
     let meter = if is_worker { admission.unsent.clone() } else { Meter::default() };
     let (outbox, queues) = link::metered(URGENT_QUEUE, BULK_QUEUE, meter);
     let hang_up = CancellationToken::new();
-    let writing = tokio::spawn(writer.run(queues));
+    let mut writing = tokio::spawn(writer.run(queues));
     let traits = PeerTraits {
         greeting: Greeting { name: hello.name, threads, identity, address: Some(address.ip()) },
         loopback: link::is_this_pc(address.ip()),
@@ -155,7 +155,7 @@ pub async fn serve(
     // Workers are the scheduler's to watch, which probes them. A client pings by itself;
     // one that is silent for so long is gone, and its shots hold the farm for nobody.
     let patience = (!is_worker).then_some(admission.silence * CLIENT_PATIENCE);
-    let mut leaving = false;
+    let (mut leaving, mut is_written, mut unsent) = (false, false, None);
     let how = loop {
         tokio::select! {
             () = hang_up.cancelled() => break Ok(()),
@@ -174,19 +174,28 @@ pub async fn serve(
                     break Ok(());
                 }
             }
+            // A link that broke is noticed by reading, too, behind what was still to be heard.
+            written = &mut writing, if !is_written => {
+                is_written = true;
+                if let Ok(Err(LinkError::Wire(why))) = written {
+                    tracing::error!(?peer, "a message that cannot be sent: {why}");
+                    unsent = Some(why.to_string());
+                    break Ok(());
+                }
+            }
         }
     };
-    let (reason, text) = match how {
-        Ok(()) if leaving => (LostReason::Left, "said goodbye".to_owned()),
-        Ok(()) => (LostReason::Broken, "the connection was closed".to_owned()),
-        Err(why @ LinkError::Wire(_)) => (LostReason::Misbehaved, why.to_string()),
-        Err(why) => (LostReason::Broken, why.to_string()),
+    let (reason, text) = match (unsent, how) {
+        (Some(why), _) => (LostReason::Broken, why),
+        (None, Ok(())) if leaving => (LostReason::Left, "said goodbye".to_owned()),
+        (None, Ok(())) => (LostReason::Broken, "the connection was closed".to_owned()),
+        (None, Err(why @ LinkError::Wire(_))) => (LostReason::Misbehaved, why.to_string()),
+        (None, Err(why)) => (LostReason::Broken, why.to_string()),
     };
     let _ = admission.events.send(ToDriver::Event(peer, PeerEvent::Gone(reason, text))).await;
     // The driver has dropped the outbox by now or will; what is queued is still sent, but
     // not for ever.
-    let mut writing = writing;
-    if tokio::time::timeout(admission.greeting_limit, &mut writing).await.is_err() {
+    if !is_written && tokio::time::timeout(admission.greeting_limit, &mut writing).await.is_err() {
         writing.abort();
     }
 }

@@ -278,7 +278,7 @@ impl Shots {
     /// Adds cameras to a submission; when the last one is there, the shot begins.
     ///
     /// # Errors
-    /// If they do not continue what came before: the shot is dropped.
+    /// If they do not continue what came before: a shot that has not begun is dropped.
     pub fn add_cameras(
         &mut self,
         client: ClientId,
@@ -293,6 +293,9 @@ impl Shots {
             return Err("cameras of a shot that was not submitted".into());
         };
         let total = shot.submit.frames as usize;
+        if shot.cameras.len() == total {
+            return Err("the shot has all its cameras and is under way".into());
+        }
         let sized = |camera: &Camera| {
             camera.width == shot.submit.width && camera.height == shot.submit.height
         };

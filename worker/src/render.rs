@@ -31,6 +31,8 @@ use terrafarm_terrain::resident::Resident;
 /// by `auto`, 1920 x 1080, nanoseconds a pixel for sides of 32, 64, 128 and 256: finding depths
 /// 33, 16, 13, 11.5, all 46, 29, 25, 23.5 (example `frame` of the ray caster).
 const PIECE_PX: u32 = 128;
+/// The shortest side of a piece, pixels.
+const LEAST_PIECE_PX: u32 = 16;
 /// Side of a piece where each thread gets at least [`LARGE_PIECES`] of them, or one thread all.
 const LARGE_PIECE_PX: u32 = 256;
 /// So many that threads that wait for the last one cost less than the larger pieces save.
@@ -249,7 +251,8 @@ impl<C: Caster> Job<C> {
         check: Check,
         stop: Arc<AtomicBool>,
     ) -> Self {
-        let side = piece_px(region, rayon::current_num_threads() as u64);
+        let side =
+            piece_px(region, rayon::current_num_threads() as u64, view.quality.samples_per_side);
         let pieces = tiles(region.width, region.height, side).into_iter().map(|piece| {
             let region = Region { x: region.x + piece.x, y: region.y + piece.y, ..piece };
             Piece {
@@ -385,11 +388,14 @@ impl<C: Caster> Job<C> {
     }
 }
 
-/// The side of the pieces of a region that so many threads render.
-fn piece_px(region: Region, threads: u64) -> u32 {
+/// The side of the pieces of a region that so many threads render, with so many samples along
+/// a side of each pixel: what a piece takes in memory grows with its samples.
+fn piece_px(region: Region, threads: u64, samples: u32) -> u32 {
     let pixels = u64::from(region.width) * u64::from(region.height);
     let large = pixels / u64::from(LARGE_PIECE_PX).pow(2);
-    if threads == 1 || large >= LARGE_PIECES * threads { LARGE_PIECE_PX } else { PIECE_PX }
+    let alone = threads == 1 || large >= LARGE_PIECES * threads;
+    let side = if alone { LARGE_PIECE_PX } else { PIECE_PX };
+    (side / samples.max(1)).max(LEAST_PIECE_PX)
 }
 
 /// Has the threads of the pool that it is called on take items until there are none, never

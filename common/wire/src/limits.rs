@@ -4,6 +4,7 @@
 #[cfg(doc)]
 use terrafarm_common::accuracy::KEPT_MAX;
 use terrafarm_common::camera::MAX_SIDE_PX;
+use terrafarm_common::id::MAX_SHOT_FRAMES;
 
 /// The oldest protocol version this program speaks.
 pub const OLDEST_VERSION: u16 = 1;
@@ -54,8 +55,8 @@ pub const AHEAD_CAMERAS_MAX: usize = 64;
 pub const HAND_BACK_MAX: usize = 1024;
 /// Most cameras in one message.
 pub const CAMERAS_MAX: usize = 1024;
-/// Most frames of a shot: nearly five hours at 60 Hz.
-pub const FRAMES_MAX: u32 = 1 << 20;
+/// Most frames of a shot.
+pub const FRAMES_MAX: u32 = MAX_SHOT_FRAMES;
 /// Most finished frames that may wait for a client.
 pub const FRAMES_IN_FLIGHT_MAX: u32 = 1024;
 /// Most workers named in the summary of a shot: 128 of the longest names are 34 KiB.

@@ -317,7 +317,7 @@ pub(crate) fn fit_quality(quality: Quality) -> Result<(), Unfit> {
 pub(crate) fn fit_split(split: Split) -> Result<(), Unfit> {
     let fits = match split {
         Split::Columns => true,
-        Split::Tiles(side) => (1..=MAX_SIDE_PX).contains(&side),
+        Split::Tiles(side) => (1..=Split::MAX_TILE_SIDE).contains(&side),
     };
     Unfit::unless(fits, "the side of the tiles is out of range")
 }
@@ -338,8 +338,8 @@ pub(crate) fn fit_shading(shading: &Shading) -> Result<(), Unfit> {
         Unfit::unless(visible && scale && color(&haze.color), "the haze is out of range")?;
     }
     if let Some(earth) = &shading.earth {
-        let fits =
-            (1e5..=1e8).contains(&earth.radius_m) && (-1.0..=0.9).contains(&earth.refraction);
+        let fits = Earth::RADII_M.contains(&earth.radius_m)
+            && Earth::REFRACTIONS.contains(&earth.refraction);
         Unfit::unless(fits, "the radius of the Earth or the refraction is out of range")?;
     }
     let colors = [shading.sky.horizon, shading.sky.zenith, shading.below_ground];

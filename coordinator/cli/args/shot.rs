@@ -59,6 +59,9 @@ pub struct Casting {
     pub check: Share,
 }
 
+/// The shortest side of a tile, pixels: smaller ones are all overhead.
+const MIN_TILE_SIDE: u32 = 8;
+
 fn parse_range(text: &str) -> Result<(u32, u32), String> {
     text.split_once("..")
         .and_then(|(first, end)| Some((first.parse().ok()?, end.parse().ok()?)))
@@ -71,8 +74,13 @@ fn parse_split(text: &str) -> Result<Split, String> {
         None if text == "columns" => Ok(Split::Columns),
         None if text == "tiles" => Ok(Split::Tiles(128)),
         Some(("tiles", side)) => match side.parse::<u32>() {
-            Ok(side) if (8..=4096).contains(&side) => Ok(Split::Tiles(side)),
-            _ => Err("a tile has 8 to 4096 pixels a side, such as tiles:128".into()),
+            Ok(side) if (MIN_TILE_SIDE..=Split::MAX_TILE_SIDE).contains(&side) => {
+                Ok(Split::Tiles(side))
+            }
+            _ => Err(format!(
+                "a tile has {MIN_TILE_SIDE} to {} pixels a side, such as tiles:128",
+                Split::MAX_TILE_SIDE
+            )),
         },
         _ => Err("choose columns, tiles or tiles:SIDE".into()),
     }
@@ -88,6 +96,8 @@ mod tests {
         assert!(parse_range("9..3").is_err());
         assert_eq!(parse_split("tiles:64"), Ok(Split::Tiles(64)));
         assert!(parse_split("tiles:0").is_err());
+        assert_eq!(parse_split("tiles:2048"), Ok(Split::Tiles(2048)));
+        assert!(parse_split("tiles:2049").is_err());
         assert!(parse_split("rows").is_err());
     }
 }

@@ -1,6 +1,7 @@
 //! `terrafarm terrain ...`, as typed.
 
 use clap::{Args as ClapArgs, Subcommand, ValueEnum};
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 /// `terrafarm terrain ...`
@@ -34,12 +35,27 @@ pub enum Terrain {
         #[arg(short, long)]
         output: PathBuf,
         /// Direction of the light, degrees clockwise from grid north
-        #[arg(long, default_value_t = 315.0)]
+        #[arg(long, default_value_t = 315.0, value_parser = parse_azimuth,
+            allow_negative_numbers = true)]
         azimuth: f64,
         /// Height of the light above the horizon, degrees
-        #[arg(long, default_value_t = 45.0)]
+        #[arg(long, default_value_t = 45.0, value_parser = parse_altitude,
+            allow_negative_numbers = true)]
         altitude: f64,
     },
+}
+
+fn parse_azimuth(text: &str) -> Result<f64, String> {
+    parse_degrees(text, -360.0..=360.0)
+}
+
+fn parse_altitude(text: &str) -> Result<f64, String> {
+    parse_degrees(text, 0.0..=90.0)
+}
+
+fn parse_degrees(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
+    let degrees = text.parse().ok().filter(|degrees| range.contains(degrees));
+    degrees.ok_or_else(|| format!("choose {} to {} degrees", range.start(), range.end()))
 }
 
 /// `terrafarm terrain import`

@@ -249,7 +249,13 @@ impl SceneFile {
             haze,
             sky,
             curvature: self.earth.curvature,
-            refraction: number(self.earth.refraction, "[earth] refraction", 0.13, -2.0, 0.99)?,
+            refraction: number(
+                self.earth.refraction,
+                "[earth] refraction",
+                0.13,
+                *Earth::REFRACTIONS.start(),
+                *Earth::REFRACTIONS.end(),
+            )?,
             bare_ground: source.color(self.ground.color)?,
             below_ground: source.color(self.ground.below)?.unwrap_or([0.03, 0.02, 0.02]),
         })

@@ -2,13 +2,15 @@
 
 use serde::{Deserialize, Serialize};
 use terrafarm_common::accuracy::Share;
+use terrafarm_common::id::MAX_SHOT_FRAMES;
+use terrafarm_common::region::Split;
 
 /// The most workers connected at once; more are dropped as they join.
 pub const MAX_WORKERS: usize = 16_384;
 /// The most shots queued or running at once; more are refused.
 pub const MAX_SHOTS: usize = 256;
-/// The most frames of one shot: 46 hours at 60 Hz. Frames cost memory only in flight.
-pub const MAX_FRAMES: u32 = 10_000_000;
+/// The most frames of one shot. They cost memory only in flight.
+pub const MAX_FRAMES: u32 = MAX_SHOT_FRAMES;
 /// The most frames of one shot that may be open or waiting to be taken.
 pub const MAX_FRAMES_IN_FLIGHT: u32 = 1024;
 /// The most jobs that one frame can be cut into.
@@ -56,7 +58,7 @@ impl Default for Config {
             max_held: 8,
             job_min_us: 20_000,
             job_max_us: 250_000,
-            max_job_px: 1 << 22,
+            max_job_px: (Split::MAX_TILE_SIDE as u64).pow(2),
             lease_factor: 4.0,
             lease_floor_us: 10_000_000,
             heartbeat_us: 1_000_000,

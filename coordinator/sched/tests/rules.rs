@@ -417,7 +417,8 @@ fn numbers_out_of_range_are_refused_with_their_limit() {
         [Action::ShotFailed { reason, .. }] => reason.to_string(),
         other => panic!("{other:?}"),
     };
-    assert_eq!(message(farm.submit(1, 0, 0, 1)), "the number of frames is 0; choose 1 to 10000000");
+    let range = format!("the number of frames is 0; choose 1 to {MAX_FRAMES}");
+    assert_eq!(message(farm.submit(1, 0, 0, 1)), range);
     assert!(message(farm.submit(1, 1, 0, 0)).contains("in flight"));
     for side in [0, 1, u32::MAX] {
         assert!(message(farm.submit_split(1, 1, 0, 1, Split::Tiles(side))).contains("tile"));
@@ -428,7 +429,7 @@ fn numbers_out_of_range_are_refused_with_their_limit() {
 fn a_full_queue_of_endless_shots_costs_nothing_before_they_begin() {
     let mut farm = Farm::new();
     for shot in 0..MAX_SHOTS as u64 {
-        // With a byte for each frame this would be 2.5 GB.
+        // With a byte for each frame this would be 256 MiB.
         assert!(farm.submit(shot, MAX_FRAMES, 0, MAX_FRAMES_IN_FLIGHT).is_empty());
     }
     let refused = farm.submit(9999, 1, 0, 1);

@@ -2,7 +2,10 @@
 #![allow(clippy::unwrap_used)]
 
 use super::*;
+use crate::queue::ShotPlan;
 use crate::queue::tests::house::{Land, plan};
+use std::path::Path;
+use terrafarm_common::shading::Earth;
 use terrafarm_wire::link::{accept, handshake::program};
 use terrafarm_wire::message::Accepted;
 use tokio::net::TcpListener;
@@ -13,13 +16,9 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// bytes than sockets hold.
 const QUESTIONS: usize = 2000;
 
-/// A shot is submitted, and the link gets stuck; what comes of it when `stop` is cancelled.
-async fn stuck(silence: Duration, stop: impl FnOnce(CancellationToken)) -> ClientError {
-    let folder = tempfile::tempdir().unwrap();
-    let land = Land::new(folder.path());
-    let store = StoreReader::open(&folder.path().join("land.terrain")).unwrap();
-    let plan = plan(&land, 1);
-    let submission = Submission {
+fn submission(plan: ShotPlan, folder: &Path) -> Submission {
+    let store = StoreReader::open(&folder.join("land.terrain")).unwrap();
+    Submission {
         name: plan.name,
         store: Arc::new(store),
         shading: plan.shading,
@@ -30,7 +29,14 @@ async fn stuck(silence: Duration, stop: impl FnOnce(CancellationToken)) -> Clien
         frames_in_flight: 1,
         priority: 0,
         live: false,
-    };
+    }
+}
+
+/// A shot is submitted, and the link gets stuck; what comes of it when `stop` is cancelled.
+async fn stuck(silence: Duration, stop: impl FnOnce(CancellationToken)) -> ClientError {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let submission = submission(plan(&land, 1), folder.path());
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let coordinator = Coordinator::local(listener.local_addr().unwrap());
     let (updates, _inbox) = mpsc::channel(8);
@@ -69,4 +75,20 @@ async fn a_client_whose_terrain_nobody_takes_can_be_stopped() {
 async fn a_client_whose_terrain_nobody_takes_notices_a_coordinator_that_is_gone() {
     let ended = stuck(Duration::from_secs(3), drop).await;
     assert!(matches!(ended, ClientError::Link(_)), "{ended}");
+}
+
+#[tokio::test]
+async fn a_shot_that_no_farm_takes_is_refused_before_one_is_called() {
+    let folder = tempfile::tempdir().unwrap();
+    let land = Land::new(folder.path());
+    let mut plan = plan(&land, 1);
+    plan.shading.earth = Some(Earth { radius_m: 6.37e6, refraction: 0.95 });
+    let submission = submission(plan, folder.path());
+    // Port 0 is nobody's: calling it would be another error.
+    let coordinator = Coordinator::local("127.0.0.1:0");
+    let (updates, _inbox) = mpsc::channel(8);
+    let (_taken, taken) = mpsc::channel(8);
+    let ended = render(&coordinator, submission, updates, taken, CancellationToken::new()).await;
+    let Err(ClientError::Unfit(why)) = ended else { panic!("{:?}", ended.map(|_| ())) };
+    assert!(why.contains("refraction"), "{why}");
 }

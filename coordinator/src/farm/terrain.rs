@@ -5,7 +5,7 @@ use crate::blobs::{ClientId, Order};
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use terrafarm_common::id::{BlobHash, FrameIndex, ShotId, WorkerId};
-use terrafarm_wire::limits::{ELSEWHERE_MAX, clip_reason};
+use terrafarm_wire::limits::{ELSEWHERE_MAX, WANT_BLOBS_MAX, clip_reason};
 use terrafarm_wire::link::is_this_pc;
 use terrafarm_wire::message::{Ahead, Blob, Elsewhere, NoBlob, WantBlobs};
 
@@ -58,7 +58,10 @@ impl Farm {
             }
         }
         for (client, hashes) in asks {
-            self.send(Peer::Client(client), WantBlobs { hashes, elsewhere: false });
+            for hashes in hashes.chunks(WANT_BLOBS_MAX) {
+                let hashes = hashes.to_vec();
+                self.send(Peer::Client(client), WantBlobs { hashes, elsewhere: false });
+            }
         }
     }
 

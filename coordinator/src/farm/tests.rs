@@ -3,6 +3,7 @@
 mod seen;
 
 use super::*;
+use crate::blobs::Order;
 use bytes::Bytes;
 use glam::DVec3;
 use terrafarm_common::accuracy::{PixelError, Share, Summary};
@@ -12,6 +13,8 @@ use terrafarm_common::quality::Quality;
 use terrafarm_common::region::Split;
 use terrafarm_common::shading::Shading;
 use terrafarm_terrain::store::hash_of;
+use terrafarm_wire::encode;
+use terrafarm_wire::limits::{NEWEST_VERSION, WANT_BLOBS_MAX};
 use terrafarm_wire::message::{
     Blob, Cameras, Done, Failed, HandBack, RenderReport, Submit, Timesheet, WantBlobs,
 };
@@ -172,6 +175,41 @@ fn a_shot_travels_from_its_submission_to_its_last_frame() {
     for (_, picture) in &frames {
         assert!(picture.pixels().iter().all(|&byte| byte != 0), "every pixel came from a job");
     }
+}
+
+#[test]
+fn cameras_that_come_once_more_are_refused_and_the_shot_goes_on() {
+    let mut bench = Bench::new();
+    bench.join(worker(1), 1);
+    let out = bench.submit(3);
+    let camera = Camera::from_angles(DVec3::ZERO, 0.0, 0.0, 0.0, 60.0, SIZE);
+    let again = Cameras { number: 1, first: 0, cameras: vec![camera; 3] };
+    let refused = bench.say(Peer::Client(CLIENT), again);
+    let is_refusal = |out: &Out| matches!(out, Out::Send(_, Message::Rejected(_)));
+    assert!(refused.iter().any(is_refusal), "{refused:?}");
+    assert_eq!(render_all(&mut bench, out).len(), 3);
+    let other = Peer::Client(ClientId(101));
+    bench.join(other, 0);
+    bench.say(other, submission(1));
+    let out = bench.say(other, Cameras { number: 1, first: 0, cameras: vec![camera] });
+    assert!(!grants(&out).is_empty(), "the worker is free for the next");
+}
+
+#[test]
+fn a_client_is_asked_for_no_more_blobs_at_once_than_a_message_holds() {
+    let mut bench = Bench::new();
+    bench.join(Peer::Client(CLIENT), 0);
+    let hash = |n: usize| hash_of(&n.to_le_bytes());
+    let asks = (0..WANT_BLOBS_MAX + 476).map(|n| Order::Ask(CLIENT, hash(n)));
+    bench.farm.carry_out(asks.collect());
+    let mut asked = Vec::new();
+    while let Some(out) = bench.farm.poll_out() {
+        let Out::Send(Peer::Client(CLIENT), message) = out else { panic!("{out:?}") };
+        encode(NEWEST_VERSION, &message).unwrap();
+        let Message::WantBlobs(want) = message else { panic!("{message:?}") };
+        asked.extend(want.hashes);
+    }
+    assert_eq!(asked, (0..WANT_BLOBS_MAX + 476).map(hash).collect::<Vec<_>>());
 }
 
 #[test]

@@ -1,9 +1,11 @@
 //! What is submitted to the queue: a whole shot, as JSON or in memory.
 
 use super::QueueError;
+use crate::sink::h264::MAX_MACROBLOCKS;
 use serde::{Deserialize, Serialize};
 use terrafarm_common::accuracy::Share;
 use terrafarm_common::camera::{Camera, MAX_SIDE_PX};
+use terrafarm_common::flight::MAX_FRAMES;
 use terrafarm_common::id::{BlobHash, FrameIndex};
 use terrafarm_common::quality::{Method, Quality};
 use terrafarm_common::region::Split;
@@ -19,8 +21,6 @@ pub const TEXT_BYTES_MAX: usize = 4 << 10;
 pub const PIXELS_IN_FLIGHT_MAX: u64 = 1 << 30;
 /// Fewest and most frames per second.
 const FPS: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
-/// Most macroblocks of 16 x 16 pixels in a picture of a film: level 5.2 of H.264.
-const FILM_MACROBLOCKS_MAX: u64 = 36_864;
 
 /// A film that is made of the frames when they are all there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -124,8 +124,11 @@ impl ShotPlan {
     /// [`QueueError::Unfit`], with what is wrong.
     pub(super) fn check_kept(&self, frames: u32) -> Result<(), QueueError> {
         let unfit = |why: String| Err(QueueError::Unfit(why));
-        if self.first_frame > FRAMES_MAX {
-            return unfit(format!("its first frame is {}; at most {FRAMES_MAX}", self.first_frame));
+        if self.first_frame >= MAX_FRAMES {
+            return unfit(format!(
+                "its first frame is {}; a flight has {MAX_FRAMES} at most",
+                self.first_frame
+            ));
         }
         if !FPS.contains(&self.fps) {
             let (least, most) = (FPS.start(), FPS.end());
@@ -160,7 +163,7 @@ impl ShotPlan {
             ));
         }
         let blocks = u64::from(width.div_ceil(16)) * u64::from(height.div_ceil(16));
-        if self.film.is_some() && blocks > FILM_MACROBLOCKS_MAX {
+        if self.film.is_some() && blocks > MAX_MACROBLOCKS as u64 {
             return unfit(format!(
                 "{width} x {height} pixels are more than H.264 players take; ask for no film"
             ));
@@ -263,5 +266,21 @@ mod quality {
         let Named { method, samples, tolerance_px } = Named::deserialize(from)?;
         let method: Method = method.parse().map_err(D::Error::custom)?;
         Ok(Quality { method, samples_per_side: samples, tolerance_px })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    #[test]
+    fn the_plan_in_the_documents_is_one_that_a_farm_takes() {
+        let text = include_str!("../../../docs/API.md");
+        let (_, rest) = text.split_once("```json\n{\n  \"name\"").unwrap();
+        let (rest, _) = rest.split_once("```").unwrap();
+        let plan: ShotPlan = serde_json::from_str(&format!("{{ \"name\"{rest}")).unwrap();
+        plan.check().unwrap();
     }
 }

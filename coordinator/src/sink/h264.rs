@@ -12,7 +12,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// The most macroblocks (16 x 16 pixels) of a picture at level 5.2, which is what
 /// decoders in hardware and browsers stop at: 4096 x 2304.
-pub(super) const MAX_MACROBLOCKS: usize = 36_864;
+pub(crate) const MAX_MACROBLOCKS: usize = 36_864;
 
 /// NAL unit types.
 const SLICE: u8 = 1;

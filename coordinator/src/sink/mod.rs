@@ -15,7 +15,7 @@
 mod beside;
 mod colour;
 mod ffmpeg;
-mod h264;
+pub(crate) mod h264;
 pub mod manifest;
 mod mp4;
 mod png;

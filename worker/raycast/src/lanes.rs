@@ -193,6 +193,14 @@ pub(crate) trait Ints:
     }
 }
 
+/// The last place of a table of a length from which so many elements can be read. Panics if
+/// it has less: no lane may read beside it.
+#[inline(always)]
+fn last_place(length: usize, elements: usize) -> i32 {
+    assert!(length >= elements, "a table of {length} is read by {elements}");
+    (length.min(i32::MAX as usize) - elements) as i32
+}
+
 /// Panics if a table is not what [`Ints::gather_around`] asks for: eight rows of eight, so that
 /// a square of [`Ints::around_in`] can be in it, too.
 #[inline(always)]
@@ -289,10 +297,14 @@ thread_local! {
 
 /// The widest that this processor has and [`Width::at_most`] allows.
 pub(crate) fn widest() -> Width {
-    static AVAILABLE: OnceLock<Vec<Width>> = OnceLock::new();
-    let available = AVAILABLE.get_or_init(Width::available);
     let allowed = |width: &&Width| LIMIT.get().is_none_or(|limit| **width <= limit);
-    available.iter().rev().find(allowed).copied().unwrap_or(Width::One)
+    known().iter().rev().find(allowed).copied().unwrap_or(Width::One)
+}
+
+/// [`Width::available`], asked once.
+fn known() -> &'static [Width] {
+    static KNOWN: OnceLock<Vec<Width>> = OnceLock::new();
+    KNOWN.get_or_init(Width::available)
 }
 
 /// Work that is written for any width.
@@ -302,12 +314,16 @@ pub(crate) trait Kernel {
     fn run<L: Lanes>(self) -> Self::Output;
 }
 
-/// Runs a kernel at a width that [`Width::available`] has named.
+/// Runs a kernel at a width.
+///
+/// # Panics
+/// If the processor does not have it.
 pub(crate) fn run<K: Kernel>(kernel: K, width: Width) -> K::Output {
+    assert!(known().contains(&width), "this processor has no {width:?}");
     match width {
         Width::One => kernel.run::<One>(),
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: the caller has the width from `Width::available`.
+        // SAFETY: it was seen that the processor has the width.
         Width::Eight => unsafe { avx2::run(kernel) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.

@@ -7,7 +7,7 @@
 
 mod doubles;
 
-use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask, check_rows};
+use super::{Anchor, Floats, Ints, Kernel, Lanes, MOST, Mask, check_rows, last_place};
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Mul, Neg, Not, Sub};
 
@@ -276,7 +276,7 @@ impl Ints for I {
     }
     #[inline(always)]
     fn gather_pairs(table: &[u16], at: I, mask: M) -> I {
-        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        let last = last_place(table.len(), 2);
         // SAFETY: see the page of this module; element `last + 1` is inside the table.
         unsafe {
             let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
@@ -287,7 +287,7 @@ impl Ints for I {
     }
     #[inline(always)]
     fn gather(table: &[u32], at: I, mask: M) -> I {
-        let last = (table.len().min(i32::MAX as usize) - 1) as i32;
+        let last = last_place(table.len(), 1);
         // SAFETY: see the page of this module.
         unsafe {
             let at = _mm256_min_epu32(at.0, _mm256_set1_epi32(last));
@@ -298,14 +298,14 @@ impl Ints for I {
     }
     #[inline(always)]
     fn gather_twos(table: &[u32], at: I, mask: M) -> (I, I) {
-        let last = (table.len().min(i32::MAX as usize) - 2) as i32;
+        let last = last_place(table.len(), 2);
         // SAFETY: see the page of this module; element `last + 1` is inside the table.
         unsafe { gather_eights::<4>(table.as_ptr().cast(), at, last, mask) }
     }
     #[inline(always)]
     fn gather_around(table: &[u16], at: I, stride: usize, mask: M) -> [I; 6] {
         check_rows(table, stride);
-        let last = (table.len().min(i32::MAX as usize) - (3 * stride + 5)) as i32;
+        let last = last_place(table.len(), 3 * stride + 5);
         let factors = (stride << 16 | 1) as i32;
         // SAFETY: see the page of this module; element `last + 3 * stride + 4` is inside the
         // table.
