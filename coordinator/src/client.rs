@@ -245,6 +245,7 @@ impl Errand {
 
         let mut talk = Talk::new(&self.submission, asked.len());
         let mut heartbeat = tokio::time::interval(Duration::from_micros(welcome.heartbeat_us));
+        let mut is_written = false;
         let result = loop {
             if let Some(done) = talk.finished() {
                 break Ok(done);
@@ -299,18 +300,20 @@ impl Errand {
                     Ok(None) => break Err(LinkError::Closed.into()),
                     Err(why) => break Err(why.into()),
                 },
-                written = &mut writing => break Err(match written {
-                    Ok(Err(LinkError::Wire(why))) => ClientError::Unfit(why.to_string()),
-                    Ok(Err(why)) => why.into(),
-                    Ok(Ok(())) | Err(_) => LinkError::Closed.into(),
-                }),
+                // A link that broke is noticed by reading, too, behind what was still to come.
+                written = &mut writing, if !is_written => {
+                    is_written = true;
+                    if let Ok(Err(LinkError::Wire(why))) = written {
+                        break Err(ClientError::Unfit(why.to_string()));
+                    }
+                }
             }
         };
         submitting.abort();
         serving.abort();
         let stuck = writing.abort_handle();
         // On a link that is dead, what waits to be sent would wait for ever.
-        if !matches!(result, Err(ClientError::Link(_) | ClientError::Unfit(_))) {
+        if !is_written && !matches!(result, Err(ClientError::Link(_))) {
             let farewell = async {
                 let _ = outbox.send(Goodbye { reason: "the shot is over".into() }).await;
                 drop(outbox);
