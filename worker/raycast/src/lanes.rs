@@ -195,6 +195,7 @@ pub(crate) trait Ints:
 
 /// The last place of a table of a length from which so many elements can be read. Panics if
 /// it has less: no lane may read beside it.
+#[cfg(target_arch = "x86_64")]
 #[inline(always)]
 fn last_place(length: usize, elements: usize) -> i32 {
     assert!(length >= elements, "a table of {length} is read by {elements}");
