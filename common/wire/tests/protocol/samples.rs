@@ -353,7 +353,11 @@ pub fn any_message() -> impl Strategy<Value = Message> {
                 check: Share::NONE,
                 width: side,
                 height: side,
-                split: if side % 2 == 0 { Split::Columns } else { Split::Tiles(side) },
+                split: if side % 2 == 0 {
+                    Split::Columns
+                } else {
+                    Split::Tiles(side.min(Split::MAX_TILE_SIDE))
+                },
                 frames,
                 frames_in_flight: 1 + frames % 1024,
                 priority: frames as i32 - 1000,
