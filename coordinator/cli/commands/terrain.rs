@@ -218,6 +218,9 @@ pub fn write_synth(path: &Path, spec: SynthSpec, force: bool) -> anyhow::Result<
 }
 
 fn write_hillshade(store: &Path, output: &Path, azimuth: f64, altitude: f64) -> anyhow::Result<()> {
+    if !output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+        bail!("{}: a hillshade is a PNG; choose a name that ends in .png", output.display());
+    }
     let reader = StoreReader::open(store)?;
     let (number, layer) =
         reader.index().layers_of(LayerKind::Height).next().context("the store has no heights")?;
